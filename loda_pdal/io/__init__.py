@@ -1,0 +1,1 @@
+"""Reading surveys and writing results; knows the model and nothing else of ours."""

@@ -1,0 +1,1 @@
+"""The shared words: clouds, grids, transforms, labels, dimensions, records and errors."""

@@ -1,0 +1,84 @@
+"""The limit of detection as a sparse 3D grid that can be asked anywhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from loda_pdal.model.cloud import BoolArray, Float32Array, FloatArray, IntArray
+from loda_pdal.model.transform import transform_points
+
+
+@dataclass(frozen=True)
+class LodGrid:
+    """LoD95 along the local surface normal in the occupied cells (paper, equation 2).
+
+    Attributes
+    ----------
+    cells : (c, 3) int32
+        Cell indices, lexicographically sorted, unique; a cell's centre is ``(cells + 0.5) * cell_m`` in the
+        analysis frame.
+    cell_m : float
+        Edge of a cell, m.
+    lod95 : (c,) float32, m
+        Detection limit; the low-observability value where the cell is not valid.
+    normal : (c, 3) float32
+        Unit normal of the pooled points; zero where the cell is not valid.
+    n_before, n_after : (c,) int32
+        Pooled points of each epoch.
+    is_valid : (c,) bool
+        Whether both epochs have enough points and a plane.
+    displacement : (c,) float32, m
+        Difference of the two epochs' mean offsets along ``normal``, after minus before; NaN where not valid.
+    low_observability_m : float
+        The value where nothing is valid, m.
+    """
+
+    cells: IntArray
+    cell_m: float
+    lod95: Float32Array
+    normal: Float32Array
+    n_before: IntArray
+    n_after: IntArray
+    is_valid: BoolArray
+    displacement: Float32Array
+    low_observability_m: float
+
+    @property
+    def centres(self) -> FloatArray:
+        """Cell centres, (c, 3) m, in the analysis frame."""
+        return np.asarray((self.cells + 0.5) * self.cell_m, dtype=np.float64)
+
+    def centres_after(self, T_after_frame: FloatArray) -> FloatArray:
+        """Cell centres, (c, 3) m, in the after frame."""
+        return transform_points(T_after_frame, self.centres)
+
+    def at(self, xyz: FloatArray) -> FloatArray:
+        """LoD95 (k,) m at points (k, 3) of the analysis frame, linear between valid neighbouring cell centres.
+
+        Where none of the eight neighbours is valid the answer is ``low_observability_m``.
+        """
+        if len(self.cells) == 0 or len(xyz) == 0:
+            return np.full(len(xyz), self.low_observability_m)
+        low = self.cells.min(axis=0).astype(np.int64) - 1
+        span = self.cells.max(axis=0).astype(np.int64) - low + 2
+        keys = _key(self.cells.astype(np.int64), low, span)
+        scaled = xyz / self.cell_m - 0.5
+        base = np.floor(scaled).astype(np.int64)
+        part = scaled - base
+        total, weight = np.zeros(len(xyz)), np.zeros(len(xyz))
+        for corner in np.ndindex(2, 2, 2):
+            offset = np.array(corner)
+            cell = base + offset
+            is_inside = np.all((cell >= low) & (cell < low + span), axis=1)
+            position = np.minimum(np.searchsorted(keys, _key(cell, low, span)), len(keys) - 1)
+            is_hit = is_inside & (keys[position] == _key(cell, low, span)) & self.is_valid[position]
+            w = np.prod(np.where(offset, part, 1 - part), axis=1) * is_hit
+            total += w * self.lod95[position]
+            weight += w
+        return np.where(weight > 1e-6, total / np.maximum(weight, 1e-6), self.low_observability_m)
+
+
+def _key(cells: np.ndarray, low: np.ndarray, span: np.ndarray) -> np.ndarray:
+    return np.asarray(((cells[:, 0] - low[0]) * span[1] + cells[:, 1] - low[1]) * span[2] + cells[:, 2] - low[2])

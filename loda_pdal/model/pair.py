@@ -1,0 +1,36 @@
+"""Two of a kind, one per epoch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+U = TypeVar("U")
+V = TypeVar("V")
+
+
+@dataclass(frozen=True)
+class Pair(Generic[T]):
+    """The same thing for both epochs, told apart by name and never by position."""
+
+    before: T
+    after: T
+
+    def __iter__(self) -> Iterator[T]:
+        yield self.before
+        yield self.after
+
+    def map(self, function: Callable[[T], U]) -> Pair[U]:
+        """``Pair(function(before), function(after))``."""
+        return Pair(function(self.before), function(self.after))
+
+    def join(self, other: Pair[U], function: Callable[[T, U], V]) -> Pair[V]:
+        """Both epochs of two pairs at a time: ``Pair(function(before, other.before), ...)``."""
+        return Pair(function(self.before, other.before), function(self.after, other.after))
+
+    @property
+    def swapped(self) -> Pair[T]:
+        """The pair with its epochs exchanged."""
+        return Pair(self.after, self.before)

@@ -1,0 +1,1 @@
+"""The PDAL face: filters.python stages, pipelines and the embedded runner."""

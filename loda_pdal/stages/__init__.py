@@ -1,0 +1,1 @@
+"""One module per stage of the paper: arrays in, a result out, no files."""
