@@ -202,6 +202,9 @@ class LodParams(StageParams):
     cell_m: float = param(1.0, "edge of a cell of the sparse 3D grid", unit="m", low=0.1, high=50, is_length=True)
     radius_m: float = param(1.0, "pooling radius", unit="m", symbol="r_LoD", low=0.1, high=50, is_length=True)
     min_points: int = param(30, "points of each epoch that make a valid cell", symbol="N(g)", low=3, high=10000)
+    max_isotropy: float = param(
+        0.5, "smallest over middle eigenvalue above which a cell is not valid", low=0.001, high=1
+    )
     low_observability_m: float = param(0.50, "limit where a cell is not valid", unit="m", low=0.01, high=10)
     pose_term: str = param(
         "full",
@@ -244,6 +247,7 @@ class FeatureParams(StageParams):
     """Eigenvalue features (paper, section 4.2, equation 3)."""
 
     radius_m: float = param(0.6, "neighbourhood radius", unit="m", low=0.05, high=20, is_length=True)
+    min_neighbours: int = param(5, "points, itself included, that make a shape", low=3, high=200)
 
 
 @dataclass(frozen=True)
@@ -282,6 +286,9 @@ class SemanticParams(StageParams):
         5.0, "smallest support after merging coplanar neighbours", unit="m2", low=0.1, high=1000
     )
     merge_angle_deg: float = param(12.0, "largest angle between merged planes", unit="deg", low=1, high=90)
+    split_angle_deg: float = param(
+        12.0, "planar superpoints that run around a corner are cut at this angle; 0: never", unit="deg", low=0, high=90
+    )
     has_roofs: bool = param(True, "elevated planar patches are building too (METHOD 1.8)")
     roof_height_m: float = param(2.0, "lowest median height of a roof", unit="m", low=0.5, high=20)
     roof_area_m2: float = param(6.0, "smallest support of a roof", unit="m2", low=0.1, high=1000)
@@ -292,7 +299,7 @@ class SemanticParams(StageParams):
         low=0,
         high=20,
     )
-    vegetation_sphericity: float = param(0.35, "smallest sphericity", symbol="S", low=0, high=1)
+    vegetation_sphericity: float = param(0.20, "smallest sphericity", symbol="S", low=0, high=1)
     vegetation_height_m: float = param(0.5, "lowest median height of vegetation", unit="m", low=0, high=10)
     vegetation_azimuth_deg: float = param(30.0, "smallest spread of normal azimuths", unit="deg", low=0, high=360)
     mobile_length_m: float = param(5.0, "longest mobile object", unit="m", low=0.5, high=30)
@@ -375,7 +382,27 @@ class ChangeParams(StageParams):
         2.0, "largest centroid shift of an unchanged mobile object", unit="m", low=0, high=100
     )
     visible_only: bool = param(True, "compare volumes only where both surveys had coverage (METHOD 1.13)")
+    displacement_m: float = param(
+        0.15, "normal displacement that is a change on its own (METHOD 1.10); 0: never", unit="m", low=0, high=100
+    )
+    height_reference: str = param(
+        "map",
+        "dh between tops in the common frame, or between heights above each epoch's own ground",
+        choices=("map", "ground"),
+    )
+    volume_reference: str = param(
+        "mean", "dV is related to the mean volume of both epochs, or to the before volume", choices=("mean", "before")
+    )
+    min_support: float = param(
+        0.5, "share of an unmatched object's surface in the other survey that makes it Unchanged", low=0, high=1
+    )
+    backing_voxels: int = param(
+        8, "occupancy voxels gained or lost that must back a height or volume cue; 0: none", low=0, high=10000
+    )
     find_parts: bool = param(True, "a change confined to a part becomes its own object (METHOD 2b)")
+    part_of_length_m: float = param(
+        15.0, "only objects longer than this are looked through for parts", unit="m", low=0, high=1000
+    )
     part_min_voxels: int = param(24, "occupancy voxels of the smallest part", low=1, high=10000)
 
 
@@ -398,6 +425,15 @@ class ConfidenceParams(StageParams):
     weight_overlap: float = param(0.20, "weight of the overlap", low=0, high=1)
     weight_shift: float = param(0.10, "weight of the centroid shift", low=0, high=1)
     weight_displacement: float = param(0.15, "weight of the normal displacement", low=0, high=1)
+    calibration_unmatched: tuple[float, ...] = param(
+        (0.0, 2.0), "logistic offset and slope of Added and Removed", low=-50, high=50
+    )
+    calibration_changed: tuple[float, ...] = param(
+        (0.0, 2.0), "logistic offset and slope of Increased and Decreased", low=-50, high=50
+    )
+    calibration_unchanged: tuple[float, ...] = param(
+        (0.0, 2.0), "logistic offset and slope of Unchanged", low=-50, high=50
+    )
 
 
 @dataclass(frozen=True)
@@ -628,10 +664,24 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
         "lod": {"pose_term": "translation"},
         "association": {"boxes": "pca"},
         "superpoints": {"absorb_below": 1},
-        "semantics": {"has_roofs": False, "points_near_ground_are_ground": False, "building_top_m": 0.0},
+        "semantics": {
+            "vegetation_sphericity": 0.35,
+            "split_angle_deg": 0.0,
+            "has_roofs": False,
+            "points_near_ground_are_ground": False,
+            "building_top_m": 0.0,
+        },
         "instances": {"join_by_footprint": False, "splits_crowns": False},
         "observability": {"is_enabled": False},
-        "changes": {"visible_only": False, "find_parts": False},
+        "changes": {
+            "visible_only": False,
+            "find_parts": False,
+            "displacement_m": 0.0,
+            "height_reference": "ground",
+            "volume_reference": "before",
+            "min_support": 1.0,
+            "backing_voxels": 0,
+        },
     },
 }
 

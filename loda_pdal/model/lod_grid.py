@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from loda_pdal.model.cloud import BoolArray, Float32Array, FloatArray, IntArray
+from loda_pdal.model.grid import Lattice
 from loda_pdal.model.transform import transform_points
 
 
@@ -61,24 +62,17 @@ class LodGrid:
         """
         if len(self.cells) == 0 or len(xyz) == 0:
             return np.full(len(xyz), self.low_observability_m)
-        low = self.cells.min(axis=0).astype(np.int64) - 1
-        span = self.cells.max(axis=0).astype(np.int64) - low + 2
-        keys = _key(self.cells.astype(np.int64), low, span)
+        lattice = Lattice.around(self.cells.astype(np.int64))
+        keys = lattice.keys(self.cells.astype(np.int64))
         scaled = xyz / self.cell_m - 0.5
         base = np.floor(scaled).astype(np.int64)
         part = scaled - base
         total, weight = np.zeros(len(xyz)), np.zeros(len(xyz))
         for corner in np.ndindex(2, 2, 2):
             offset = np.array(corner)
-            cell = base + offset
-            is_inside = np.all((cell >= low) & (cell < low + span), axis=1)
-            position = np.minimum(np.searchsorted(keys, _key(cell, low, span)), len(keys) - 1)
-            is_hit = is_inside & (keys[position] == _key(cell, low, span)) & self.is_valid[position]
+            position = lattice.find(keys, base + offset)
+            is_hit = (position >= 0) & self.is_valid[position]
             w = np.prod(np.where(offset, part, 1 - part), axis=1) * is_hit
             total += w * self.lod95[position]
             weight += w
         return np.where(weight > 1e-6, total / np.maximum(weight, 1e-6), self.low_observability_m)
-
-
-def _key(cells: np.ndarray, low: np.ndarray, span: np.ndarray) -> np.ndarray:
-    return np.asarray(((cells[:, 0] - low[0]) * span[1] + cells[:, 1] - low[1]) * span[2] + cells[:, 2] - low[2])
