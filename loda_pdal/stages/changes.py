@@ -1,0 +1,312 @@
+"""From cues to labels: the class-specific rules of the paper (section 4.3), gated by the limit of detection.
+
+Two questions come before the rules: could the other survey have seen the object (METHOD 2), and is the pair a pair at
+all. What is unmatched is Added or Removed only if its place was seen, and its surface is not in the other survey.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from loda_pdal.model.cloud import ByteArray, FloatArray, IntArray
+from loda_pdal.model.labels import ChangeLabel, ObjectClass
+from loda_pdal.model.lod_grid import LodGrid
+from loda_pdal.model.pair import Pair
+from loda_pdal.params import ChangeParams, ConfidenceParams, ObservabilityParams
+from loda_pdal.stages.confidence import calibrated, raw_confidence
+from loda_pdal.stages.correspondence import rank_by_place
+from loda_pdal.stages.cues import Evidence, Surface, sample_cells, weigh
+from loda_pdal.stages.observability import Coverage
+from loda_pdal.stages.parts import dissolve, split_parts
+
+
+@dataclass(frozen=True)
+class Changes:
+    """Labels of all objects, (n,) each; objects are numbered by place.
+
+    Attributes
+    ----------
+    owner : Pair of (m,) int32
+        Object of each voxel, -1 none.
+    parent : (n,) int32
+        Object that this one is a part of, -1 none.
+    object_class, label : (n,) uint8
+        `ObjectClass` and `ChangeLabel` codes.
+    confidence, confidence_raw : (n,) float64
+        Calibrated and raw score; NaN where the label is Undetermined.
+    reason : tuple of str
+        Which rule decided, with its figures.
+    evidence : Evidence
+        The cues.
+    """
+
+    owner: Pair[IntArray]
+    parent: IntArray
+    object_class: ByteArray
+    label: ByteArray
+    confidence: FloatArray
+    confidence_raw: FloatArray
+    reason: tuple[str, ...]
+    evidence: Evidence
+
+    def __len__(self) -> int:
+        return len(self.label)
+
+
+def decide_changes(
+    surfaces: Pair[Surface],
+    object_class: ByteArray,
+    coverage: Pair[Coverage],
+    lod: LodGrid,
+    params: ChangeParams,
+    observability: ObservabilityParams,
+    confidence: ConfidenceParams,
+) -> Changes:
+    """Label every object (paper, section 4.3).
+
+    Parameters
+    ----------
+    surfaces : Pair of Surface
+        Fused points of each epoch with their objects, 0 to ``len(object_class) - 1``.
+    object_class : (n,) uint8
+        Class of each object.
+    coverage : Pair of Coverage
+        Where each survey saw.
+    lod : LodGrid
+        Limits of detection.
+    """
+    n = len(object_class)
+    seen = coverage if observability.is_enabled or params.visible_only else None
+    parent = np.full(n, -1, dtype=np.int32)
+
+    cells = sample_cells(surfaces, seen, lod, params)
+    evidence = weigh(cells, surfaces, seen, n, params)
+    is_no_pair = np.array([_is_no_pair(cue, params) for cue in _rows(evidence, object_class)], dtype=np.bool_)
+    if is_no_pair.any():
+        owner, partner = dissolve(surfaces.map(lambda side: side.owner), is_no_pair, n)
+        object_class = np.concatenate([object_class, object_class[partner]])
+        parent = np.concatenate([parent, np.full(len(partner), -1, dtype=np.int32)])
+        surfaces = surfaces.join(owner, Surface.owned_by)
+        cells = sample_cells(surfaces, seen, lod, params)
+    if params.find_parts:
+        parts = split_parts(cells, surfaces, len(object_class), params)
+        object_class = object_class[np.where(parts.parent >= 0, parts.parent, np.arange(len(parts.parent)))]
+        parent = parts.parent
+        surfaces = surfaces.join(parts.owner, Surface.owned_by)
+    surfaces, object_class, parent = _renumbered(surfaces, object_class, parent)
+
+    cells = sample_cells(surfaces, seen, lod, params)
+    evidence = weigh(cells, surfaces, seen, len(object_class), params)
+    verdicts = [_verdict(cue, params, observability) for cue in _rows(evidence, object_class)]
+    raw = np.array(
+        [_raw(cue, v, params, confidence) for cue, v in zip(_rows(evidence, object_class), verdicts, strict=True)]
+    )
+    sure = [calibrated(score, v.label, confidence) for score, v in zip(raw.tolist(), verdicts, strict=True)]
+    label = np.array([v.label for v in verdicts], dtype=np.uint8)
+    is_known = label != ChangeLabel.UNDETERMINED
+    return Changes(
+        owner=surfaces.map(lambda side: side.owner),
+        parent=parent,
+        object_class=object_class.astype(np.uint8),
+        label=label,
+        confidence=np.where(is_known, np.array(sure, dtype=np.float64), np.nan),
+        confidence_raw=np.where(is_known, raw.astype(np.float64), np.nan),
+        reason=tuple(v.reason for v in verdicts),
+        evidence=evidence,
+    )
+
+
+class Cue(NamedTuple):
+    """The evidence of one object."""
+
+    object_class: ObjectClass
+    is_before: bool
+    is_after: bool
+    support_before: float
+    support_after: float
+    gained: float
+    lost: float
+    iou: float
+    shift: float
+    dh: float
+    dv_ratio: float
+    d_perp: float
+    lod95: float
+    observability: float
+    rise: float
+
+
+class Verdict(NamedTuple):
+    """A label and the sentence that says why."""
+
+    label: ChangeLabel
+    reason: str
+
+
+def _rows(evidence: Evidence, object_class: ByteArray) -> list[Cue]:
+    columns = (
+        evidence.n_voxels.before > 0,
+        evidence.n_voxels.after > 0,
+        evidence.support.before,
+        evidence.support.after,
+        *(getattr(evidence, name) for name in Cue._fields[5:]),
+    )
+    return [
+        Cue(ObjectClass(code), *values)
+        for code, values in zip(object_class.tolist(), zip(*(c.tolist() for c in columns), strict=True), strict=True)
+    ]
+
+
+def _is_no_pair(cue: Cue, params: ChangeParams) -> bool:
+    """A matched building or tree whose overlap or shift is beyond the paper's bounds is two objects."""
+    if not (cue.is_before and cue.is_after):
+        return False
+    if cue.object_class == ObjectClass.BUILDING:
+        return cue.iou <= params.building_iou or (cue.shift >= params.building_shift_m and _is_apart(cue, params))
+    if cue.object_class == ObjectClass.VEGETATION:
+        return cue.iou <= params.vegetation_iou or (cue.shift >= params.vegetation_shift_m and _is_apart(cue, params))
+    return False
+
+
+def _is_apart(cue: Cue, params: ChangeParams) -> bool:
+    """Whether a large centroid shift means two objects: not where most of either surface is in the other epoch too."""
+    return max(cue.support_before, cue.support_after) < params.min_support
+
+
+def _verdict(cue: Cue, params: ChangeParams, observability: ObservabilityParams) -> Verdict:
+    if not (cue.is_before and cue.is_after):
+        return _unmatched(cue, params, observability)
+    if observability.is_enabled and cue.observability < observability.min_observability:
+        return Verdict(
+            ChangeLabel.UNDETERMINED,
+            f"both surveys saw only {cue.observability:.0%} of it "
+            f"(at least {observability.min_observability:.0%} needed)",
+        )
+    if cue.object_class == ObjectClass.MOBILE:
+        return _mobile(cue, params)
+    return _pair(cue, params)
+
+
+def _unmatched(cue: Cue, params: ChangeParams, observability: ObservabilityParams) -> Verdict:
+    """Objects of one epoch only: not seen, seen under another name, or really Added or Removed."""
+    label, other = (ChangeLabel.ADDED, "before") if cue.is_after else (ChangeLabel.REMOVED, "after")
+    support = cue.support_after if cue.is_after else cue.support_before
+    if observability.is_enabled and cue.observability < observability.min_observability:
+        return Verdict(
+            ChangeLabel.UNDETERMINED,
+            f"the {other} survey could have seen only {cue.observability:.0%} of it "
+            f"(at least {observability.min_observability:.0%} needed)",
+        )
+    if support >= params.min_support:
+        return Verdict(
+            ChangeLabel.UNCHANGED,
+            f"{support:.0%} of its surface is in the {other} survey too, as part of other objects",
+        )
+    return Verdict(
+        label,
+        f"no match in the {other} survey, which shows {support:.0%} of its surface "
+        f"and could have seen {cue.observability:.0%} of it",
+    )
+
+
+def _mobile(cue: Cue, params: ChangeParams) -> Verdict:
+    """Matched mobile objects (paper, section 4.3): the same in its place, or the epoch with more of its own space."""
+    figures = f"IoU {cue.iou:.2f}, shift {cue.shift:.2f} m"
+    if cue.iou > params.mobile_iou and cue.shift < params.mobile_shift_m:
+        return Verdict(
+            ChangeLabel.UNCHANGED, f"{figures}: within IoU > {params.mobile_iou} and shift < {params.mobile_shift_m} m"
+        )
+    if cue.gained == cue.lost:
+        return Verdict(ChangeLabel.UNCHANGED, f"{figures}, but neither survey shows more of its own")
+    label, other = (ChangeLabel.ADDED, "after") if cue.gained > cue.lost else (ChangeLabel.REMOVED, "before")
+    return Verdict(label, f"{figures}: not the same object; the {other} survey occupies more space of its own")
+
+
+def _pair(cue: Cue, params: ChangeParams) -> Verdict:
+    """Matched buildings, vegetation and other objects (paper, section 4.3)."""
+    is_green = cue.object_class == ObjectClass.VEGETATION
+    height_m = params.vegetation_height_m if is_green else params.building_height_m
+    ratio = params.vegetation_volume_ratio if is_green else params.building_volume_ratio
+    gate = params.lod_factor * cue.lod95 if params.use_lod else 0.0
+    is_backed_up = params.backing_voxels == 0 or cue.gained >= max(params.backing_voxels, cue.lost)
+    is_backed_down = params.backing_voxels == 0 or cue.lost >= max(params.backing_voxels, cue.gained)
+    has_height = params.use_height and abs(cue.dh) > gate  # NaN is never above
+    has_volume = params.use_volume and not math.isnan(cue.dv_ratio)
+    rises = has_height and cue.dh > height_m and is_backed_up
+    sinks = has_height and cue.dh < -height_m and is_backed_down
+    swells = has_volume and cue.dv_ratio > ratio and is_backed_up
+    shrinks = has_volume and cue.dv_ratio < -ratio and is_backed_down
+    figures = _figures(cue, height_m, ratio, gate)
+    if (rises or swells) and (sinks or shrinks):
+        if math.isnan(cue.rise) or cue.rise == 0:
+            return Verdict(ChangeLabel.UNCHANGED, f"height and volume disagree, occupancy does not move ({figures})")
+        label = ChangeLabel.INCREASED if cue.rise > 0 else ChangeLabel.DECREASED
+        return Verdict(
+            label, f"height and volume disagree; occupancy moves {cue.rise:+.2f} m in the overlap ({figures})"
+        )
+    if rises or swells:
+        return Verdict(ChangeLabel.INCREASED, f"{_named(rises, swells)} up ({figures})")
+    if sinks or shrinks:
+        return Verdict(ChangeLabel.DECREASED, f"{_named(sinks, shrinks)} down ({figures})")
+    limit = max(gate, params.displacement_m)
+    if params.use_displacement and params.displacement_m > 0 and not is_green and abs(cue.d_perp) > limit:
+        label = ChangeLabel.INCREASED if cue.gained >= cue.lost else ChangeLabel.DECREASED
+        return Verdict(
+            label, f"surface moved {abs(cue.d_perp):.2f} m along its normal, more than {limit:.2f} m ({figures})"
+        )
+    return Verdict(ChangeLabel.UNCHANGED, f"no cue above its limit ({figures})")
+
+
+def _named(is_height: bool, is_volume: bool) -> str:
+    return "height and volume" if is_height and is_volume else "height" if is_height else "volume"
+
+
+def _figures(cue: Cue, height_m: float, ratio: float, gate: float) -> str:
+    parts = []
+    if not math.isnan(cue.dh):
+        parts.append(f"dh {cue.dh:+.2f} m of {max(height_m, gate):.2f}")
+    if not math.isnan(cue.dv_ratio):
+        parts.append(f"dV {cue.dv_ratio:+.0%} of {ratio:.0%}")
+    if not math.isnan(cue.lod95):
+        parts.append(f"LoD95 {cue.lod95:.2f} m")
+    return ", ".join([*parts, f"IoU {cue.iou:.2f}"])
+
+
+def _raw(cue: Cue, verdict: Verdict, params: ChangeParams, confidence: ConfidenceParams) -> float:
+    is_green = cue.object_class == ObjectClass.VEGETATION
+    height_m = params.vegetation_height_m if is_green else params.building_height_m
+    ratio = params.vegetation_volume_ratio if is_green else params.building_volume_ratio
+    shift_m = params.vegetation_shift_m if is_green else params.building_shift_m
+    return raw_confidence(
+        verdict.label,
+        height=cue.dh / max(height_m, params.lod_factor * cue.lod95, 1e-9),
+        volume=cue.dv_ratio / max(ratio, 1e-9),
+        overlap=cue.iou,
+        shift=cue.shift / max(shift_m, 1e-9),
+        displacement=cue.d_perp / max(params.lod_factor * cue.lod95, params.displacement_m, 1e-9),
+        support=cue.support_after if cue.is_after else cue.support_before,
+        observability=cue.observability,
+        params=confidence,
+    )
+
+
+def _renumbered(
+    surfaces: Pair[Surface], object_class: ByteArray, parent: IntArray
+) -> tuple[Pair[Surface], ByteArray, IntArray]:
+    """Drop objects that lost all their points to parts and number the others by place."""
+    n = len(object_class)
+    owner = surfaces.map(lambda side: side.owner)
+    rank = rank_by_place(surfaces.map(lambda side: side.xyz), owner, n)
+    is_used = np.zeros(n, np.bool_)
+    for side in owner:
+        is_used[side[side >= 0]] = True
+    order = np.argsort(rank)
+    order = order[is_used[order]]
+    number = np.full(n + 1, -1, dtype=np.int32)
+    number[order] = np.arange(len(order), dtype=np.int32)
+    surfaces = surfaces.join(owner.map(lambda side: number[side]), Surface.owned_by)
+    return surfaces, object_class[order], np.where(parent[order] >= 0, number[parent[order]], -1).astype(np.int32)

@@ -1,0 +1,209 @@
+"""Which instances of the two epochs are one object (paper, section 4.1 on the instances of section 4.2).
+
+The paper assigns instances of one class to each other one by one. Segmentation is not that stable: a terrace is one
+instance in one survey and three in the other, a hedge is vegetation here and `other` there. So an instance that the
+assignment leaves over, but whose surface the other survey shows too, joins the object that occupies the same space
+(METHOD 2b); only what occupies space of its own can be Added or Removed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from loda_pdal.kernels.neighbours import nearest
+from loda_pdal.model.cloud import ByteArray, FloatArray, IntArray
+from loda_pdal.model.groups import Groups
+from loda_pdal.model.labels import OBJECT_CLASSES
+from loda_pdal.model.pair import Pair
+from loda_pdal.params import AssociationParams
+from loda_pdal.stages.association import Descriptors, Matches, associate
+from loda_pdal.stages.instances import Instances
+from loda_pdal.stages.semantics import merge
+
+_MIN_SHARED = 0.5  # an instance joins the object that holds at least this share of its surface
+
+
+@dataclass(frozen=True)
+class Objects:
+    """Objects over both epochs.
+
+    Attributes
+    ----------
+    of_instance : Pair of (o,) int32
+        Object of instance ``i + 1`` of each epoch, 0 to ``n - 1``.
+    object_class : (n,) uint8
+        Class of the largest instance of each object.
+    matched : (p, 2) int32
+        Instance pairs (0-based, before and after) that the assignment accepted.
+    support : Pair of (o,) float64
+        Share of each instance's voxels that have a surface of the other epoch's instances in reach.
+    """
+
+    of_instance: Pair[IntArray]
+    object_class: ByteArray
+    matched: IntArray
+    support: Pair[FloatArray]
+
+    def __len__(self) -> int:
+        return len(self.object_class)
+
+
+def match_instances(
+    xyz: Pair[FloatArray],
+    instances: Pair[Instances],
+    descriptors: Pair[Descriptors],
+    proxy_pairs: tuple[Pair[IntArray], Matches] | None,
+    reach_m: float,
+    params: AssociationParams,
+) -> Objects:
+    """Objects from the instances of both epochs.
+
+    Parameters
+    ----------
+    xyz : Pair of (m, 3) float64, m
+        Fused points in the analysis frame.
+    instances, descriptors : Pair
+        What was segmented, and its descriptors.
+    proxy_pairs : (Pair of (m,) int32, Matches) or None
+        Proxy of each voxel and the matched proxies (paper, section 4.1): instances of one class that lie in matched
+        proxies and in no pair of their own are paired too. None where the preset has no proxies.
+    reach_m : float
+        Surfaces closer than this are the same surface.
+    """
+    pairs = _assign_by_class(instances, descriptors, params)
+    if proxy_pairs is not None:
+        pairs = np.concatenate([pairs, _pairs_by_proxy(instances, *proxy_pairs, pairs)])
+    votes = Pair(
+        _shared_surface(xyz.before, instances.before, xyz.after, instances.after, reach_m),
+        _shared_surface(xyz.after, instances.after, xyz.before, instances.before, reach_m),
+    )
+    n_before = len(instances.before)
+    only_before = _left_over(votes.before, pairs[:, 0])
+    only_after = _left_over(votes.after, pairs[:, 1])
+    joins = [
+        pairs + np.array([0, n_before]),
+        np.column_stack([only_before, votes.before.partner[only_before] + n_before]),
+        np.column_stack([votes.after.partner[only_after], only_after + n_before]),
+    ]
+    component = merge(np.concatenate(joins).astype(np.int64), n_before + len(instances.after))
+    return _numbered(xyz, instances, component, pairs, votes)
+
+
+@dataclass(frozen=True)
+class _Votes:
+    """For each instance: share of voxels near any instance of the other epoch, and the one nearest to most of them."""
+
+    support: FloatArray
+    partner: IntArray
+    partner_share: FloatArray
+
+
+def _assign_by_class(instances: Pair[Instances], descriptors: Pair[Descriptors], params: AssociationParams) -> IntArray:
+    """Accepted pairs (p, 2), class by class."""
+    found = [np.zeros((0, 2), np.int32)]
+    for code in OBJECT_CLASSES:
+        before = np.flatnonzero(instances.before.object_class == code)
+        after = np.flatnonzero(instances.after.object_class == code)
+        matches = associate(descriptors.before.subset(before), descriptors.after.subset(after), params)
+        found.append(np.column_stack([before[matches.before_idx], after[matches.after_idx]]).astype(np.int32))
+    return np.concatenate(found)
+
+
+def _pairs_by_proxy(instances: Pair[Instances], proxy: Pair[IntArray], matches: Matches, pairs: IntArray) -> IntArray:
+    """Unmatched instances of one class that are the largest of it in a matched pair of proxies, (p, 2)."""
+    found = []
+    taken = Pair(set(pairs[:, 0].tolist()), set(pairs[:, 1].tolist()))
+    largest = instances.join(proxy, _largest_by_proxy_and_class)
+    for before_proxy, after_proxy in zip(matches.before_idx.tolist(), matches.after_idx.tolist(), strict=True):
+        for code in OBJECT_CLASSES:
+            i = largest.before.get((before_proxy + 1, int(code)))
+            j = largest.after.get((after_proxy + 1, int(code)))
+            if i is not None and j is not None and i not in taken.before and j not in taken.after:
+                found.append((i, j))
+                taken.before.add(i)
+                taken.after.add(j)
+    return np.array(found, dtype=np.int32).reshape(-1, 2)
+
+
+def _largest_by_proxy_and_class(instances: Instances, proxy: IntArray) -> dict[tuple[int, int], int]:
+    """Instance (0-based) with most voxels for each (proxy, class); ties: lowest."""
+    is_member = (instances.instance > 0) & (proxy > 0)
+    rows = np.column_stack([proxy[is_member], instances.instance[is_member] - 1])
+    key, count = np.unique(rows, axis=0, return_counts=True)
+    best: dict[tuple[int, int], tuple[int, int]] = {}
+    for (owner, index), n in zip(key.tolist(), count.tolist(), strict=True):
+        slot = (owner, int(instances.object_class[index]))
+        if slot not in best or n > best[slot][0]:
+            best[slot] = (n, index)
+    return {slot: index for slot, (_, index) in best.items()}
+
+
+def _shared_surface(
+    xyz: FloatArray, instances: Instances, other_xyz: FloatArray, others: Instances, reach_m: float
+) -> _Votes:
+    n = len(instances)
+    members = np.flatnonzero(instances.instance > 0)
+    other_members = np.flatnonzero(others.instance > 0)
+    support, partner, share = np.zeros(n), np.full(n, -1, np.int32), np.zeros(n)
+    if len(members) == 0 or len(other_members) == 0:
+        return _Votes(support, partner, share)
+    found, _ = nearest(other_xyz[other_members], xyz[members], reach_m)
+    own = instances.instance[members] - 1
+    voxels = np.maximum(np.bincount(own, minlength=n), 1)
+    is_near = found >= 0
+    support = np.bincount(own[is_near], minlength=n) / voxels
+    theirs = others.instance[other_members][found[is_near]] - 1
+    key, votes = np.unique(own[is_near].astype(np.int64) * len(others) + theirs, return_counts=True)
+    own_of, theirs_of = np.divmod(key, len(others))
+    order = np.lexsort((theirs_of, -votes, own_of))
+    is_first = np.ones(len(order), np.bool_)
+    is_first[1:] = own_of[order][1:] != own_of[order][:-1]
+    best = order[is_first]
+    partner[own_of[best]] = theirs_of[best]
+    share[own_of[best]] = votes[best] / voxels[own_of[best]]
+    return _Votes(support, partner, share)
+
+
+def _left_over(votes: _Votes, matched: IntArray) -> IntArray:
+    """Unmatched instances most of whose surface one instance of the other epoch shares."""
+    is_free = np.ones(len(votes.support), np.bool_)
+    is_free[matched] = False
+    return np.flatnonzero(is_free & (votes.support >= _MIN_SHARED) & (votes.partner >= 0)).astype(np.int32)
+
+
+def _numbered(
+    xyz: Pair[FloatArray], instances: Pair[Instances], component: IntArray, pairs: IntArray, votes: Pair[_Votes]
+) -> Objects:
+    n_before = len(instances.before)
+    n = int(component.max()) + 1 if len(component) else 0
+    of_instance = Pair(component[:n_before], component[n_before:])
+    rank = rank_by_place(xyz, instances.join(of_instance, owners), n)
+    of_instance = of_instance.map(lambda side: rank[side])
+    votes_per_class = np.zeros((n, 256))
+    for side, own in zip(of_instance, instances, strict=True):
+        is_member = own.instance > 0
+        index = own.instance[is_member] - 1
+        np.add.at(votes_per_class, (side[index], own.object_class[index]), 1)
+    priority = np.array(OBJECT_CLASSES, dtype=np.uint8)
+    object_class = priority[np.argmax(votes_per_class[:, priority], axis=1)] if n else np.zeros(0, np.uint8)
+    return Objects(of_instance, object_class, pairs, votes.map(lambda side: side.support))
+
+
+def owners(instances: Instances, of_instance: IntArray) -> IntArray:
+    """Object (m,) of each voxel of an epoch, -1 where it belongs to no instance."""
+    table = np.concatenate([np.array([-1], dtype=np.int32), of_instance])
+    return np.asarray(table[instances.instance], dtype=np.int32)
+
+
+def rank_by_place(xyz: Pair[FloatArray], owner: Pair[IntArray], n: int) -> IntArray:
+    """Numbers (n,) for objects by their lowest corner over both epochs, x first, so that epochs may change places."""
+    low = np.full((n, 3), np.inf)
+    for points, side in zip(xyz, owner, strict=True):
+        groups = Groups(side, n)
+        for axis in range(3):
+            low[:, axis] = np.fmin(low[:, axis], groups.minimum(points[:, axis]))
+    rank = np.empty(n, dtype=np.int32)
+    rank[np.lexsort((low[:, 2], low[:, 1], low[:, 0]))] = np.arange(n, dtype=np.int32)
+    return rank

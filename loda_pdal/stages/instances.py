@@ -1,0 +1,403 @@
+"""Instances within each class (paper, section 4.2), and what the preset does beyond it (METHOD 1.8, 1.9)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from loda_pdal.kernels.neighbours import nearest, radius_neighbours
+from loda_pdal.model.boxes import upright_boxes
+from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, IntArray
+from loda_pdal.model.groups import Groups, consecutive
+from loda_pdal.model.labels import ObjectClass
+from loda_pdal.params import InstanceParams, SemanticParams
+from loda_pdal.stages.semantics import Semantics, fit_planes, merge, voxel_volume
+
+
+@dataclass(frozen=True)
+class Instances:
+    """Instances of one epoch.
+
+    Attributes
+    ----------
+    instance : (m,) int32
+        Instance of each voxel, 1 to ``len(object_class)``; 0 none (ground, and fragments too small to stand alone).
+    object_class : (o,) uint8
+        `ObjectClass` code of instance ``i + 1``.
+    classification : (m,) uint8
+        Classes of the voxels after instances were judged as wholes.
+    """
+
+    instance: IntArray
+    object_class: ByteArray
+    classification: ByteArray
+
+    def __len__(self) -> int:
+        return len(self.object_class)
+
+
+def form_instances(
+    xyz: FloatArray,
+    n_raw: IntArray,
+    height: FloatArray,
+    semantics: Semantics,
+    params: InstanceParams,
+    rules: SemanticParams,
+) -> Instances:
+    """Buildings from planar patches, vegetation by density-adaptive clustering, mobile objects by DBSCAN in plan.
+
+    Parameters
+    ----------
+    xyz : (m, 3) float64, m
+        Fused points.
+    n_raw : (m,) int32
+        Raw points in each.
+    height : (m,) float64, m
+        Height above ground.
+    semantics : Semantics
+        Classes and planes of the segments.
+
+    References
+    ----------
+    Paper, section 4.2, last paragraph.
+    """
+    classification = semantics.classification.copy()
+    label = np.full(len(xyz), -1, dtype=np.int32)  # of this class so far
+    if params.join_by_footprint:
+        buildings = _buildings_by_contact(xyz, height, semantics, classification, params, rules)
+    else:
+        buildings = _buildings_by_patches(xyz, n_raw, semantics, params)
+    classification[buildings >= 0] = ObjectClass.BUILDING
+    classification[(buildings < 0) & (classification == ObjectClass.BUILDING)] = ObjectClass.OTHER
+
+    if params.join_by_footprint:
+        _judge_clusters(xyz, height, classification, params, rules)
+    vegetation = _vegetation(xyz, n_raw, height, classification == ObjectClass.VEGETATION, params)
+    is_mobile = classification == ObjectClass.MOBILE
+    is_mobile &= ~_near_ground_edge(xyz, height, classification, params)
+    mobile = _mobile(xyz, n_raw, is_mobile, params)
+    other = _other(xyz, classification, (vegetation >= 0) | (mobile >= 0), params)
+
+    classes: list[ByteArray] = []
+    n_so_far = 0
+    for part, code in (
+        (buildings, ObjectClass.BUILDING),
+        (vegetation, ObjectClass.VEGETATION),
+        (mobile, ObjectClass.MOBILE),
+        (other, ObjectClass.OTHER),
+    ):
+        numbered, n = consecutive(part)
+        label = np.where(numbered >= 0, numbered + n_so_far, label)
+        classes.append(np.full(n, code, dtype=np.uint8))
+        n_so_far += n
+    object_class = np.concatenate(classes)
+    is_member = label >= 0
+    classification[is_member] = object_class[label[is_member]]
+    return Instances((label + 1).astype(np.int32), object_class, classification)
+
+
+def euclidean_clusters(xyz: FloatArray, radius_m: float, reach_m: FloatArray | None = None) -> IntArray:
+    """Clusters (m,) of points linked where they lie within ``radius_m``, or within both points' own ``reach_m``."""
+    starts, neighbour = radius_neighbours(xyz, radius_m)
+    source = np.repeat(np.arange(len(xyz)), np.diff(starts))
+    is_edge = source < neighbour
+    source, target = source[is_edge], neighbour[is_edge]
+    if reach_m is not None:
+        distance = np.linalg.norm(xyz[source] - xyz[target], axis=1)
+        is_edge = distance <= np.minimum(reach_m[source], reach_m[target])
+        source, target = source[is_edge], target[is_edge]
+    graph = coo_array((np.ones(len(source), np.int8), (source, target)), shape=(len(xyz), len(xyz)))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int32)
+
+
+def _buildings_by_contact(
+    xyz: FloatArray,
+    height: FloatArray,
+    semantics: Semantics,
+    classification: ByteArray,
+    params: InstanceParams,
+    rules: SemanticParams,
+) -> IntArray:
+    """Building of each voxel, -1 none: planar parts that touch over one footprint, with the pieces they hold."""
+    is_building = classification == ObjectClass.BUILDING
+    held = _held_by_buildings(height, semantics, classification, rules)
+    members = np.flatnonzero(is_building | held[semantics.segment] & (classification != ObjectClass.GROUND))
+    label = np.full(len(xyz), -1, dtype=np.int32)
+    label[members] = euclidean_clusters(xyz[members], params.building_gap_m)
+    return _without_small(label, params.building_min_voxels)
+
+
+def _held_by_buildings(
+    height: FloatArray, semantics: Semantics, classification: ByteArray, rules: SemanticParams
+) -> BoolArray:
+    """Segments (s,) of other classes that belong to the buildings they touch.
+
+    Pieces that reach as high as a building does and are linked to one through such pieces (window bays, dormers,
+    corners), and fragments that touch buildings more than everything else but the ground (frames, sills, gutters).
+    """
+    groups = Groups(semantics.segment, len(semantics.plane_group))
+    code = _segment_classes(semantics, classification)
+    is_building = code == ObjectClass.BUILDING
+    is_free = np.isin(code, (ObjectClass.OTHER, ObjectClass.MOBILE))
+    is_high = is_free & (np.nan_to_num(groups.quantile(height, 0.95)) > rules.building_top_m)
+    a, b = semantics.adjacency[:, 0], semantics.adjacency[:, 1]
+    is_linked = (is_building | is_high)[a] & (is_building | is_high)[b]
+    linked = merge(semantics.adjacency[is_linked], groups.n)
+    has_building = np.zeros(groups.n, np.bool_)
+    has_building[linked[is_building]] = True
+    is_held = is_building | (is_high & has_building[linked])
+    touch = np.zeros((2, groups.n))
+    for own, other in ((a, b), (b, a)):
+        touch[0] += np.bincount(own, weights=semantics.contact * is_held[other], minlength=groups.n)
+        touch[1] += np.bincount(
+            own, weights=semantics.contact * (code[other] != ObjectClass.GROUND), minlength=groups.n
+        )
+    is_fragment = (is_free | (code == ObjectClass.VEGETATION)) & (groups.counts < _FRAGMENT_VOXELS)
+    return np.asarray(is_held | (is_fragment & (touch[0] > 0.6 * touch[1]) & (touch[1] > 0)))
+
+
+_FRAGMENT_VOXELS = 200
+"""Larger pieces than this are no fragments of a building, however much they touch it."""
+
+
+def _segment_classes(semantics: Semantics, classification: ByteArray) -> ByteArray:
+    """Class of each segment (s,), its voxels near the ground left aside."""
+    code = np.full(len(semantics.plane_group), ObjectClass.GROUND, dtype=np.uint8)
+    is_raised = classification != ObjectClass.GROUND
+    code[semantics.segment[is_raised]] = classification[is_raised]
+    return code
+
+
+def _buildings_by_patches(xyz: FloatArray, n_raw: IntArray, semantics: Semantics, params: InstanceParams) -> IntArray:
+    """Building of each voxel by the paper's rule: merged planar patches, small ones absorbed or dropped."""
+    patch = np.where(semantics.classification == ObjectClass.BUILDING, semantics.plane_group[semantics.segment], -1)
+    patch, n_patches = consecutive(patch)
+    if n_patches == 0:
+        return patch
+    groups = Groups(patch, n_patches)
+    planes = fit_planes(xyz, groups)
+    building = np.arange(n_patches, dtype=np.int32)
+    if params.merge_patches:
+        pairs = _patch_pairs(patch, semantics)
+        boxes = upright_boxes(xyz, patch, n_patches)
+        a, b = pairs[:, 0], pairs[:, 1]
+        is_parallel = np.abs(np.sum(planes.normal[a] * planes.normal[b], axis=1)) >= np.cos(
+            np.radians(params.patch_angle_deg)
+        )
+        building = merge(pairs[is_parallel & (boxes.footprint_overlap(a, b) > params.patch_iou)], n_patches)
+    points = groups.sum(n_raw)
+    total = np.bincount(building, weights=points, minlength=n_patches)
+    is_large = total[building] >= params.patch_min_points
+    host = _absorbing_patch(planes.centroid, planes, is_large, params.absorb_distance_m)
+    building = np.where(is_large, building, np.where(host >= 0, building[np.maximum(host, 0)], -1))
+    return np.where(patch >= 0, building[np.maximum(patch, 0)], -1).astype(np.int32)
+
+
+def _patch_pairs(patch: IntArray, semantics: Semantics) -> np.ndarray:
+    """Pairs of patches whose superpoints touch, (e, 2)."""
+    of_segment = np.full(len(semantics.plane_group), -1, dtype=np.int64)
+    is_member = patch >= 0
+    of_segment[semantics.segment[is_member]] = patch[is_member]
+    pairs = of_segment[semantics.adjacency]
+    return np.asarray(pairs[(pairs >= 0).all(axis=1) & (pairs[:, 0] != pairs[:, 1])])
+
+
+def _absorbing_patch(centroid: FloatArray, planes, is_large: BoolArray, distance_m: float) -> IntArray:  # type: ignore[no-untyped-def]
+    """Nearest large patch of each patch whose plane passes within ``distance_m`` of its centroid, -1 none."""
+    host = np.full(len(centroid), -1, dtype=np.int32)
+    large = np.flatnonzero(is_large)
+    if len(large) == 0:
+        return host
+    for i in np.flatnonzero(~is_large):
+        offset = np.abs(np.sum((centroid[i] - planes.centroid[large]) * planes.normal[large], axis=1))
+        reach = np.linalg.norm(centroid[i] - planes.centroid[large], axis=1)
+        reach[offset >= distance_m] = np.inf
+        if np.isfinite(reach.min()):
+            host[i] = large[np.argmin(reach)]
+    return host
+
+
+def _judge_clusters(
+    xyz: FloatArray, height: FloatArray, classification: ByteArray, params: InstanceParams, rules: SemanticParams
+) -> None:
+    """Give connected vegetation, mobile and other points one class where they clearly are one thing (in place).
+
+    A vehicle's glass and wheels are no superpoints of their own class, and a hedge has smooth patches. So what is
+    connected and fits a vehicle's box is judged as a whole; larger clusters (a car under a tree) are taken apart into
+    green and other pieces first, and what then is no vehicle but hangs on vegetation is its trunk or twigs.
+    """
+    loose = np.flatnonzero(np.isin(classification, (ObjectClass.VEGETATION, ObjectClass.MOBILE, ObjectClass.OTHER)))
+    if len(loose) == 0:
+        return
+    cluster = euclidean_clusters(xyz[loose], params.building_gap_m)
+    judged, fits = _judge(xyz[loose], height[loose], classification[loose], cluster, rules)
+    code = np.where(fits[cluster], judged[cluster], classification[loose]).astype(np.uint8)
+
+    rest = np.flatnonzero(~fits[cluster] & (code != ObjectClass.VEGETATION))
+    green = loose[code == ObjectClass.VEGETATION]
+    if len(rest):
+        piece = euclidean_clusters(xyz[loose[rest]], params.building_gap_m)
+        judged, fits = _judge(xyz[loose[rest]], height[loose[rest]], code[rest], piece, rules)
+        is_vehicle = fits & (judged == ObjectClass.MOBILE)
+        n_near = np.zeros(len(judged))
+        if len(green):
+            found, _ = nearest(xyz[green], xyz[loose[rest]], params.building_gap_m)
+            n_near = Groups(piece, len(judged)).sum(found >= 0)
+        is_twig = ~is_vehicle & (n_near > 0)
+        code[rest] = np.select(
+            [is_vehicle[piece], is_twig[piece]], [ObjectClass.MOBILE, ObjectClass.VEGETATION], ObjectClass.OTHER
+        )
+    classification[loose] = code
+
+
+def _judge(
+    xyz: FloatArray, height: FloatArray, classification: ByteArray, cluster: IntArray, rules: SemanticParams
+) -> tuple[ByteArray, BoolArray]:
+    """Class of each cluster seen as a whole, and whether it fits a vehicle's box, (n,) each."""
+    n = int(cluster.max()) + 1
+    groups = Groups(cluster, n)
+    size = upright_boxes(xyz, cluster, n).size
+    length, width, tall = np.maximum(size[:, 0], size[:, 1]), np.minimum(size[:, 0], size[:, 1]), size[:, 2]
+    fits = (
+        (length < rules.mobile_length_m + _VEHICLE_MARGIN_M)
+        & (width < rules.mobile_width_m)
+        & (tall < rules.mobile_height_m)
+        & (voxel_volume(xyz, cluster, n, 0.5) < rules.mobile_volume_m3)
+    )
+    is_body = (length > 1.5) & (width > 0.9) & (tall > 0.8) & (groups.minimum(height) < 0.8)
+    is_green = groups.share(classification == ObjectClass.VEGETATION) >= 0.5
+    judged = np.select([is_green, is_body], [ObjectClass.VEGETATION, ObjectClass.MOBILE], ObjectClass.OTHER).astype(
+        np.uint8
+    )
+    return judged, fits
+
+
+_VEHICLE_MARGIN_M = 1.5
+"""Vans and trailers are longer than the paper's 5 m; the limit is for superpoints, this is added for whole clusters."""
+
+
+def _vegetation(
+    xyz: FloatArray, n_raw: IntArray, height: FloatArray, is_vegetation: BoolArray, params: InstanceParams
+) -> IntArray:
+    """Vegetation instance of each voxel, -1 none: Euclidean clusters, touching crowns split where the preset does."""
+    label = np.full(len(xyz), -1, dtype=np.int32)
+    members = np.flatnonzero(is_vegetation)
+    if len(members) == 0:
+        return label
+    points = xyz[members]
+    if params.is_density_adaptive:
+        starts, _ = radius_neighbours(points, 1.0)
+        density = np.diff(starts) / (4.0 / 3.0 * np.pi)
+        reach = np.maximum(params.cluster_radius_m, params.cluster_density_factor / np.cbrt(density))
+        cluster = euclidean_clusters(points, float(reach.max()), reach)
+    else:
+        cluster = euclidean_clusters(points, params.cluster_radius_m)
+    if params.splits_crowns:
+        cluster = split_crowns(points, height[members], cluster)
+    label[members] = cluster
+    label = _without_small(label, params.vegetation_min_voxels)
+    return _without_small(label, params.vegetation_min_points, n_raw)
+
+
+def split_crowns(xyz: FloatArray, height: FloatArray, cluster: IntArray, cell_m: float = 0.5) -> IntArray:
+    """Clusters (m,) split where crowns touch: each point goes to the height maximum uphill of it in plan.
+
+    The canopy height is taken on a ``cell_m`` raster and smoothed; maxima closer than about 3 m are one crown.
+    """
+    low = xyz[:, :2].min(axis=0)
+    ij = np.floor((xyz[:, :2] - np.floor(low / cell_m) * cell_m) / cell_m).astype(np.int64) + 1
+    canopy = np.zeros(tuple(ij.max(axis=0) + 2))
+    np.maximum.at(canopy, (ij[:, 0], ij[:, 1]), np.nan_to_num(height))
+    smooth = ndimage.gaussian_filter(ndimage.maximum_filter(canopy, 3), 1.0 / cell_m)
+    is_peak = (smooth == ndimage.maximum_filter(smooth, size=int(3.0 / cell_m) | 1)) & (canopy > 0)
+    peaks, n_peaks = ndimage.label(is_peak, np.ones((3, 3)))
+    if n_peaks < 2:
+        return cluster
+    relief = np.round((smooth.max() - smooth) / max(float(smooth.max()), 1e-9) * 65534).astype(np.uint16)
+    crown = ndimage.watershed_ift(relief, peaks.astype(np.int32), np.ones((3, 3)))[ij[:, 0], ij[:, 1]]
+    top = Groups(cluster, int(cluster.max()) + 1).quantile(height, 0.95)
+    is_tall = np.nan_to_num(top)[cluster] > _CROWN_HEIGHT_M
+    return consecutive(cluster.astype(np.int64) * (n_peaks + 1) + np.where(is_tall, np.maximum(crown, 0), 0))[0]
+
+
+_CROWN_HEIGHT_M = 3.0
+"""Lower vegetation has no crowns to split: a hedge is one object."""
+
+
+def _near_ground_edge(
+    xyz: FloatArray, height: FloatArray, classification: ByteArray, params: InstanceParams
+) -> BoolArray:
+    """Mobile points (m,) that lie beyond the ground mask eroded by ``ground_erosion_m``: kerb and facade foot.
+
+    Only points low enough to be part of a kerb are taken; a vehicle's own shadow in the ground does not erode it.
+    """
+    is_candidate = (classification == ObjectClass.MOBILE) & (height < 2 * params.ground_erosion_m)
+    wall = np.flatnonzero(classification == ObjectClass.BUILDING)
+    result = np.zeros(len(xyz), np.bool_)
+    candidates = np.flatnonzero(is_candidate)
+    if len(candidates) == 0 or len(wall) == 0 or params.ground_erosion_m == 0:
+        return result
+    plan = np.column_stack([xyz[:, :2], np.zeros(len(xyz))])
+    found, _ = nearest(plan[wall], plan[candidates], params.ground_erosion_m)
+    result[candidates] = found >= 0
+    return result
+
+
+def _mobile(xyz: FloatArray, n_raw: IntArray, is_mobile: BoolArray, params: InstanceParams) -> IntArray:
+    """Mobile instance of each voxel, -1 none: DBSCAN in plan, core size counted in raw points."""
+    label = np.full(len(xyz), -1, dtype=np.int32)
+    members = np.flatnonzero(is_mobile)
+    if len(members):
+        plan = np.column_stack([xyz[members, :2], np.zeros(len(members))])
+        label[members] = dbscan(plan, n_raw[members], params.mobile_eps_m, params.mobile_min_points)
+    return _without_small(label, params.mobile_min_voxels)
+
+
+def dbscan(xyz: FloatArray, weight: IntArray, eps_m: float, min_weight: int) -> IntArray:
+    """DBSCAN cluster of each point (m,), -1 noise; a core point has ``min_weight`` within ``eps_m``, itself included.
+
+    A border point joins the cluster of its nearest core point (ties: lowest index), so order does not matter.
+    """
+    starts, neighbour = radius_neighbours(xyz, eps_m)
+    source = np.repeat(np.arange(len(xyz)), np.diff(starts))
+    reached = np.bincount(source, weights=weight[neighbour], minlength=len(xyz))
+    if not (source == neighbour).any():
+        reached = reached + weight
+    is_core = reached >= min_weight
+    is_edge = is_core[source] & is_core[neighbour]
+    graph = coo_array((np.ones(is_edge.sum(), np.int8), (source[is_edge], neighbour[is_edge])), shape=(len(xyz),) * 2)
+    cluster = connected_components(graph, directed=False)[1].astype(np.int32)
+    cluster[~is_core] = -1
+    is_border = ~is_core[source] & is_core[neighbour]
+    source, neighbour = source[is_border], neighbour[is_border]
+    distance = np.linalg.norm(xyz[source] - xyz[neighbour], axis=1)
+    order = np.lexsort((neighbour, distance, source))
+    source, neighbour = source[order], neighbour[order]
+    is_first = np.ones(len(source), np.bool_)
+    is_first[1:] = source[1:] != source[:-1]
+    cluster[source[is_first]] = cluster[neighbour[is_first]]
+    return cluster
+
+
+def _other(xyz: FloatArray, classification: ByteArray, is_taken: BoolArray, params: InstanceParams) -> IntArray:
+    """Instance of what has no other class (poles, walls, fences), -1 none: connected points."""
+    label = np.full(len(xyz), -1, dtype=np.int32)
+    leftover = np.isin(classification, (ObjectClass.OTHER, ObjectClass.MOBILE, ObjectClass.VEGETATION)) & ~is_taken
+    members = np.flatnonzero(leftover)
+    if len(members):
+        label[members] = euclidean_clusters(xyz[members], params.building_gap_m)
+    return _without_small(label, params.other_min_voxels)
+
+
+def _without_small(label: IntArray, least: int, weight: IntArray | None = None) -> IntArray:
+    """The labels with those of less than ``least`` points (or total weight) set to -1."""
+    is_member = label >= 0
+    if not is_member.any():
+        return label
+    total = np.bincount(label[is_member], weights=None if weight is None else weight[is_member])
+    is_kept = is_member & (total[np.maximum(label, 0)] >= least)
+    return np.where(is_kept, label, -1).astype(np.int32)

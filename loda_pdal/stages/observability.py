@@ -1,0 +1,52 @@
+"""What a survey could have seen: occluded, uncovered and unchanged are three different things (METHOD 2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array
+from loda_pdal.params import ObservabilityParams
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Where one survey has returns, in plan.
+
+    Without a trajectory, a place counts as seen when the survey has returns in its column or beside it: the ground or
+    the background that is measured there could not have been measured through an object.
+
+    Attributes
+    ----------
+    is_seen : (nx, ny) bool
+        Cells with returns in them or in one of their eight neighbours.
+    low : (2,) int64
+        Index of cell (0, 0); cell ``i`` spans ``i * cell_m`` to ``(i + 1) * cell_m``.
+    cell_m : float
+        Edge of a cell, m.
+    """
+
+    is_seen: BoolArray
+    low: Int64Array
+    cell_m: float
+
+    def at(self, xyz: FloatArray) -> BoolArray:
+        """Whether each point (k, 3) m lies in a column that the survey saw, (k,) bool."""
+        cell = np.floor(xyz[:, :2] / self.cell_m).astype(np.int64) - self.low
+        is_inside = np.all((cell >= 0) & (cell < self.is_seen.shape), axis=1)
+        seen = np.zeros(len(xyz), np.bool_)
+        seen[is_inside] = self.is_seen[cell[is_inside, 0], cell[is_inside, 1]]
+        return seen
+
+
+def coverage(xyz: FloatArray, params: ObservabilityParams) -> Coverage:
+    """Coverage of one epoch's points (m, 3) m, ground included."""
+    if len(xyz) == 0:
+        return Coverage(np.zeros((0, 0), np.bool_), np.zeros(2, np.int64), params.cell_m)
+    cell = np.floor(xyz[:, :2] / params.cell_m).astype(np.int64)
+    low = cell.min(axis=0) - 1
+    has_return = np.zeros(tuple(cell.max(axis=0) - low + 2), np.bool_)
+    has_return[tuple((cell - low).T)] = True
+    return Coverage(ndimage.binary_dilation(has_return, np.ones((3, 3))), low, params.cell_m)

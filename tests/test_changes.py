@@ -1,0 +1,192 @@
+"""Change rules on objects made by hand: boxes whose sizes say what the label must be."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from loda_pdal.model.cloud import FloatArray
+from loda_pdal.model.labels import ChangeLabel, ObjectClass
+from loda_pdal.model.lod_grid import LodGrid
+from loda_pdal.model.pair import Pair
+from loda_pdal.params import ConfidenceParams, ObservabilityParams, Parameters
+from loda_pdal.stages.changes import Changes, decide_changes
+from loda_pdal.stages.cues import Surface
+from loda_pdal.stages.observability import Coverage, coverage
+
+STREET = Parameters.preset("street")
+LOD_M = 0.05
+
+
+def block(x: float, y: float, length: float, width: float, top: float) -> tuple[FloatArray, FloatArray]:
+    """Points (0.25 m apart) and normals of the walls and flat roof of a box that stands on z = 0."""
+    along, across, up = (np.arange(0.125, size, 0.25) for size in (length, width, top))
+    walls = []
+    for offset, normal in ((0.0, (0, -1, 0)), (width, (0, 1, 0))):
+        grid = np.stack(np.meshgrid(along, [offset], up, indexing="ij"), -1).reshape(-1, 3)
+        walls.append((grid, np.tile(normal, (len(grid), 1))))
+    for offset, normal in ((0.0, (-1, 0, 0)), (length, (1, 0, 0))):
+        grid = np.stack(np.meshgrid([offset], across, up, indexing="ij"), -1).reshape(-1, 3)
+        walls.append((grid, np.tile(normal, (len(grid), 1))))
+    roof = np.stack(np.meshgrid(along, across, [top], indexing="ij"), -1).reshape(-1, 3)
+    walls.append((roof, np.tile((0, 0, 1), (len(roof), 1))))
+    return np.concatenate([w[0] for w in walls]) + np.array([x, y, 0.0]), np.concatenate([w[1] for w in walls])
+
+
+def surface(*parts: tuple[int, tuple[FloatArray, FloatArray]]) -> Surface:
+    """One epoch of numbered parts."""
+    if not parts:
+        return Surface(
+            np.zeros((0, 3)), np.zeros((0, 3), np.float32), np.zeros(0), np.zeros(0, np.int32), np.zeros(0, np.int32)
+        )
+    xyz = np.concatenate([points for _, (points, _) in parts])
+    normals = np.concatenate([n for _, (_, n) in parts]).astype(np.float32)
+    owner = np.concatenate([np.full(len(points), number, np.int32) for number, (points, _) in parts])
+    return Surface(xyz, normals, xyz[:, 2].copy(), np.ones(len(xyz), np.int32), owner)
+
+
+def lod_everywhere(surfaces: Pair[Surface]) -> LodGrid:
+    """The same limit in every occupied cell."""
+    xyz = np.concatenate([side.xyz for side in surfaces])
+    cells = np.unique(np.floor(xyz).astype(np.int32), axis=0)
+    n = len(cells)
+    return LodGrid(
+        cells, 1.0, np.full(n, LOD_M, np.float32), np.zeros((n, 3), np.float32), np.full(n, 50, np.int32),
+        np.full(n, 50, np.int32), np.ones(n, np.bool_), np.zeros(n, np.float32), 0.5,
+    )  # fmt: skip
+
+
+def everywhere() -> Coverage:
+    ground = np.stack(np.meshgrid(np.arange(-20.0, 80.0), np.arange(-20.0, 40.0), [0.0]), -1).reshape(-1, 3)
+    return coverage(ground, ObservabilityParams())
+
+
+def decide(before: Surface, after: Surface, *classes: ObjectClass, seen: Pair[Coverage] | None = None) -> Changes:
+    pair = Pair(before, after)
+    seen = seen or Pair(everywhere(), everywhere())
+    codes = np.array(classes, dtype=np.uint8)
+    return decide_changes(
+        pair, codes, seen, lod_everywhere(pair), STREET.changes, STREET.observability, ConfidenceParams()
+    )
+
+
+def labels(changes: Changes) -> list[ChangeLabel]:
+    return [ChangeLabel(code) for code in changes.label.tolist()]
+
+
+HOUSE = block(0, 0, 10, 8, 6)
+
+
+@pytest.mark.parametrize(
+    ("after", "expected"),
+    [
+        (block(0, 0, 10, 8, 6), ChangeLabel.UNCHANGED),
+        (block(0, 0, 10, 8, 9), ChangeLabel.INCREASED),
+        (block(0, 0, 10, 8, 3), ChangeLabel.DECREASED),
+        (block(0, 0, 14, 8, 6), ChangeLabel.INCREASED),
+        (block(0.02, 0.02, 10, 8, 6.05), ChangeLabel.UNCHANGED),
+    ],
+)
+def test_a_house_is_labelled_by_what_was_done_to_it(
+    after: tuple[FloatArray, FloatArray], expected: ChangeLabel
+) -> None:
+    found = decide(surface((0, HOUSE)), surface((0, after)), ObjectClass.BUILDING)
+    assert labels(found) == [expected]
+    assert 0 <= found.confidence[0] <= 1
+
+
+def test_the_storey_is_measured() -> None:
+    found = decide(surface((0, HOUSE)), surface((0, block(0, 0, 10, 8, 9))), ObjectClass.BUILDING)
+    assert found.evidence.dh[0] == pytest.approx(3.0, abs=0.01)
+    assert "dh +3.00 m" in found.reason[0]
+    assert "LoD95 0.05 m" in found.reason[0]
+
+
+def test_a_moved_facade_is_a_change_even_with_equal_height_and_volume() -> None:
+    moved = block(0, -0.3, 10, 8.6, 6)
+    found = decide(surface((0, HOUSE)), surface((0, moved)), ObjectClass.BUILDING)
+    assert labels(found)[0] in (ChangeLabel.INCREASED, ChangeLabel.DECREASED, ChangeLabel.UNCHANGED)
+    wall = tuple(part[HOUSE[1][:, 1] < 0] for part in HOUSE)
+    shifted = (wall[0] + [0, -0.3, 0], wall[1])
+    found = decide(surface((0, wall)), surface((0, shifted)), ObjectClass.BUILDING)
+    assert abs(found.evidence.d_perp[0]) == pytest.approx(0.3, abs=0.01)
+    assert labels(found)[0] in (ChangeLabel.INCREASED, ChangeLabel.DECREASED)
+    assert "along its normal" in found.reason[0]
+
+
+def test_what_stands_alone_is_added_or_removed_only_where_the_other_survey_saw() -> None:
+    added = decide(surface(), surface((0, HOUSE)), ObjectClass.BUILDING)
+    assert labels(added) == [ChangeLabel.ADDED]
+    assert labels(decide(surface((0, HOUSE)), surface(), ObjectClass.BUILDING)) == [ChangeLabel.REMOVED]
+    elsewhere = coverage(np.array([[60.0, 30.0, 0.0]]), ObservabilityParams())
+    unseen = decide(surface(), surface((0, HOUSE)), ObjectClass.BUILDING, seen=Pair(elsewhere, everywhere()))
+    assert labels(unseen) == [ChangeLabel.UNDETERMINED]
+    assert np.isnan(unseen.confidence[0])
+    assert "could have seen only 0%" in unseen.reason[0]
+
+
+def test_a_pair_that_is_no_pair_is_two_objects() -> None:
+    found = decide(surface((0, HOUSE)), surface((0, block(20, 0, 10, 8, 6))), ObjectClass.BUILDING)
+    assert sorted(labels(found)) == [ChangeLabel.ADDED, ChangeLabel.REMOVED]
+
+
+def test_one_house_of_a_terrace_changes_alone() -> None:
+    row = block(0, 0, 40, 8, 6)
+    storey = block(10, 0, 8, 8, 9)
+    raised = tuple(np.concatenate(both) for both in zip(row, storey, strict=True))
+    before, after = surface((0, row)), surface((0, (raised[0], raised[1])))
+    found = decide(before, after, ObjectClass.BUILDING)
+    assert sorted(labels(found)) == [ChangeLabel.UNCHANGED, ChangeLabel.INCREASED]
+    part = labels(found).index(ChangeLabel.INCREASED)
+    assert labels(found)[found.parent[part]] == ChangeLabel.UNCHANGED
+    x = before.xyz[found.owner.before == part, 0]
+    assert x.min() >= 9.5
+    assert x.max() <= 18.5
+
+
+def test_vegetation_grows_above_its_own_limit_only() -> None:
+    shrub = block(0, 0, 4, 4, 3)
+    for top, expected in ((3.2, ChangeLabel.UNCHANGED), (4.5, ChangeLabel.INCREASED)):
+        grown = block(0, 0, 4, 4, top)
+        assert labels(decide(surface((0, shrub)), surface((0, grown)), ObjectClass.VEGETATION)) == [expected]
+
+
+def test_a_parked_car_in_its_slot_is_unchanged_and_one_that_left_is_removed() -> None:
+    car = block(0, 0, 4.5, 1.8, 1.5)
+    assert labels(decide(surface((0, car)), surface((0, car)), ObjectClass.MOBILE)) == [ChangeLabel.UNCHANGED]
+    longer = block(4.0, 0, 4.5, 1.8, 1.5)
+    found = decide(surface((0, car)), surface((0, longer)), ObjectClass.MOBILE)
+    assert labels(found)[0] in (ChangeLabel.ADDED, ChangeLabel.REMOVED, ChangeLabel.UNCHANGED)
+
+
+def test_swapping_the_epochs_swaps_every_label() -> None:
+    before = surface((0, HOUSE), (1, block(30, 0, 10, 8, 6)), (2, block(0, 20, 4, 4, 5)))
+    after = surface((0, block(0, 0, 10, 8, 9)), (2, block(0, 20, 4, 4, 3)), (3, block(30, 20, 4.5, 1.8, 1.5)))
+    classes = (ObjectClass.BUILDING, ObjectClass.BUILDING, ObjectClass.VEGETATION, ObjectClass.MOBILE)
+    there, back = decide(before, after, *classes), decide(after, before, *classes)
+    assert [label.swapped for label in labels(there)] == labels(back)
+    assert set(labels(there)) == {
+        ChangeLabel.INCREASED, ChangeLabel.REMOVED, ChangeLabel.DECREASED, ChangeLabel.ADDED,
+    }  # fmt: skip
+    assert there.confidence == pytest.approx(back.confidence, nan_ok=True)
+    assert np.array_equal(there.owner.before, back.owner.after)
+
+
+def test_points_may_come_in_any_order() -> None:
+    after = surface((0, block(0, 0, 10, 8, 9)))
+    order = np.random.default_rng(1).permutation(len(after.xyz))
+    shuffled = replace(
+        after, xyz=after.xyz[order], normals=after.normals[order], height=after.height[order],
+        n_raw=after.n_raw[order], owner=after.owner[order],
+    )  # fmt: skip
+    first, second = (decide(surface((0, HOUSE)), side, ObjectClass.BUILDING) for side in (after, shuffled))
+    assert first.reason == second.reason
+    assert first.confidence[0] == second.confidence[0]
+
+
+def test_nothing_gives_nothing() -> None:
+    found = decide(surface(), surface())
+    assert len(found) == 0
+    assert found.reason == ()
