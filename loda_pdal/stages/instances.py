@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from loda_pdal.kernels.neighbours import nearest, radius_neighbours
 from loda_pdal.model.boxes import upright_boxes
-from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, IntArray
+from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, Int64Array, IntArray
 from loda_pdal.model.groups import Groups, consecutive
 from loda_pdal.model.labels import ObjectClass
 from loda_pdal.params import InstanceParams, SemanticParams
@@ -306,22 +306,36 @@ def _vegetation(
 def split_crowns(xyz: FloatArray, height: FloatArray, cluster: IntArray, cell_m: float = 0.5) -> IntArray:
     """Clusters (m,) split where crowns touch: each point goes to the height maximum uphill of it in plan.
 
-    The canopy height is taken on a ``cell_m`` raster and smoothed; maxima closer than about 3 m are one crown.
+    The canopy height is taken on a ``cell_m`` raster and smoothed over 1 m; each cell climbs from neighbour to neighbour
+    to its maximum, and a maximum with a higher place within 1.5 m climbs on, so that close maxima are one crown.
     """
-    low = xyz[:, :2].min(axis=0)
-    ij = np.floor((xyz[:, :2] - np.floor(low / cell_m) * cell_m) / cell_m).astype(np.int64) + 1
-    canopy = np.zeros(tuple(ij.max(axis=0) + 2))
+    low = np.floor(xyz[:, :2].min(axis=0) / cell_m)
+    margin = int(np.ceil(1.5 / cell_m))
+    ij = (np.floor(xyz[:, :2] / cell_m) - low).astype(np.int64) + margin
+    canopy = np.zeros(tuple(ij.max(axis=0) + margin + 1))
     np.maximum.at(canopy, (ij[:, 0], ij[:, 1]), np.nan_to_num(height))
-    smooth = ndimage.gaussian_filter(ndimage.maximum_filter(canopy, 3), 1.0 / cell_m)
-    is_peak = (smooth == ndimage.maximum_filter(smooth, size=int(3.0 / cell_m) | 1)) & (canopy > 0)
-    peaks, n_peaks = ndimage.label(is_peak, np.ones((3, 3)))
-    if n_peaks < 2:
-        return cluster
-    relief = np.round((smooth.max() - smooth) / max(float(smooth.max()), 1e-9) * 65534).astype(np.uint16)
-    crown = ndimage.watershed_ift(relief, peaks.astype(np.int32), np.ones((3, 3)))[ij[:, 0], ij[:, 1]]
+    smooth = ndimage.gaussian_filter(ndimage.maximum_filter(canopy, 3), 0.5 / cell_m)
+    peak = _uphill(smooth, margin).ravel()[_uphill(smooth, 1)][ij[:, 0], ij[:, 1]]
     top = Groups(cluster, int(cluster.max()) + 1).quantile(height, 0.95)
     is_tall = np.nan_to_num(top)[cluster] > _CROWN_HEIGHT_M
-    return consecutive(cluster.astype(np.int64) * (n_peaks + 1) + np.where(is_tall, np.maximum(crown, 0), 0))[0]
+    return consecutive(cluster.astype(np.int64) * (smooth.size + 1) + np.where(is_tall, peak + 1, 0))[0]
+
+
+def _uphill(surface: FloatArray, reach: int) -> Int64Array:
+    """Flat index of the maximum that each cell of a raster climbs to, in steps of at most ``reach`` cells."""
+    best = surface.copy()
+    goal = np.arange(surface.size).reshape(surface.shape)
+    own = goal.copy()
+    for dx, dy in np.ndindex(2 * reach + 1, 2 * reach + 1):
+        step = (reach - dx, reach - dy)
+        value = np.roll(surface, step, axis=(0, 1))
+        is_higher = value > best
+        best = np.where(is_higher, value, best)
+        goal = np.where(is_higher, np.roll(own, step, axis=(0, 1)), goal)
+    flat = goal.ravel()
+    while not np.array_equal(flat[flat], flat):
+        flat = flat[flat]
+    return np.asarray(flat.reshape(surface.shape), dtype=np.int64)
 
 
 _CROWN_HEIGHT_M = 3.0
@@ -370,8 +384,8 @@ def dbscan(xyz: FloatArray, weight: IntArray, eps_m: float, min_weight: int) -> 
     is_core = reached >= min_weight
     is_edge = is_core[source] & is_core[neighbour]
     graph = coo_array((np.ones(is_edge.sum(), np.int8), (source[is_edge], neighbour[is_edge])), shape=(len(xyz),) * 2)
-    cluster = connected_components(graph, directed=False)[1].astype(np.int32)
-    cluster[~is_core] = -1
+    component = connected_components(graph, directed=False)[1]
+    cluster, _ = consecutive(np.where(is_core, component, -1))
     is_border = ~is_core[source] & is_core[neighbour]
     source, neighbour = source[is_border], neighbour[is_border]
     distance = np.linalg.norm(xyz[source] - xyz[neighbour], axis=1)

@@ -1,0 +1,157 @@
+"""Classes and instances on a small scene made by hand: what each point is, is known."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from loda_pdal.model.cloud import FloatArray, IntArray, to_local_grid
+from loda_pdal.model.groups import Groups
+from loda_pdal.model.labels import ObjectClass
+from loda_pdal.params import FuseParams, Parameters
+from loda_pdal.stages.features import eigen_features
+from loda_pdal.stages.fuse import fuse_points
+from loda_pdal.stages.instances import Instances, dbscan, euclidean_clusters, form_instances, split_crowns
+from loda_pdal.stages.semantics import classify, fit_planes, merge, support_area, touching
+from loda_pdal.stages.superpoints import superpoints
+
+STREET = Parameters.preset("street")
+
+
+def sheet(
+    rng: np.random.Generator, corner: FloatArray, u: FloatArray, v: FloatArray, density: float = 120.0
+) -> FloatArray:
+    """Random points on the parallelogram ``corner + a u + b v`` with 1 cm noise."""
+    n = int(density * np.linalg.norm(np.cross(u, v)))
+    return corner + rng.random((n, 1)) * u + rng.random((n, 1)) * v + rng.normal(0, 0.01, (n, 3))
+
+
+def box(rng: np.random.Generator, low: FloatArray, size: FloatArray) -> FloatArray:
+    x, y, z = np.diag(size)
+    sides = [(low, x, z), (low + y, x, z), (low, y, z), (low + x, y, z), (low + z, x, y)]
+    return np.concatenate([sheet(rng, *side) for side in sides])
+
+
+class Scene(NamedTuple):
+    xyz: FloatArray
+    truth: IntArray  # 0 ground, 1 and 2 houses, 3 tree, 4 and 5 cars, 6 pole
+    instances: Instances
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    rng = np.random.default_rng(4)
+    ball = rng.normal(size=(4000, 3))
+    crown = [12, 8, 5] + 2.0 * ball / np.linalg.norm(ball, axis=1, keepdims=True) * rng.random((4000, 1)) ** (1 / 3)
+    trunk = np.column_stack([np.full(150, 12.0), np.full(150, 8.0), rng.uniform(0.2, 3.4, 150)])
+    parts = [
+        sheet(rng, np.array([-10.0, -15, 0]), np.array([50.0, 0, 0]), np.array([0, 45.0, 0]), 60),
+        box(rng, np.array([-5.0, 12, 0]), np.array([9.0, 8, 6])),
+        box(rng, np.array([18.0, 12, 0]), np.array([9.0, 8, 5])),
+        np.concatenate([crown, trunk + rng.normal(0, 0.05, (150, 3))]),
+        box(rng, np.array([0.0, 0, 0.25]), np.array([4.4, 1.8, 1.3])),
+        box(rng, np.array([7.0, 0, 0.25]), np.array([4.4, 1.8, 1.3])),
+        np.column_stack([rng.normal(25, 0.06, 300), rng.normal(3, 0.06, 300), rng.uniform(0, 6, 300)]),
+    ]
+    raw = to_local_grid(np.concatenate(parts))
+    owner = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    cloud = fuse_points(raw, FuseParams())
+    truth = np.zeros(len(cloud), np.int32)
+    truth[cloud.voxel_idx] = owner  # where two parts share a voxel, either will do
+    height = cloud.xyz[:, 2].copy()
+    features = eigen_features(cloud.xyz, height, STREET.features)
+    found = superpoints(cloud.xyz, features, STREET.superpoints)
+    semantics = classify(cloud.xyz, 0.25, features, found.labels, found.n, STREET.semantics)
+    instances = form_instances(cloud.xyz, cloud.n_raw, height, semantics, STREET.instances, STREET.semantics)
+    return Scene(cloud.xyz, truth, instances)
+
+
+@pytest.mark.parametrize(
+    ("part", "expected", "share"),
+    [
+        (0, ObjectClass.GROUND, 0.99),
+        (1, ObjectClass.BUILDING, 0.95),
+        (2, ObjectClass.BUILDING, 0.95),
+        (3, ObjectClass.VEGETATION, 0.90),
+        (4, ObjectClass.MOBILE, 0.95),
+        (5, ObjectClass.MOBILE, 0.95),
+        (6, ObjectClass.OTHER, 0.85),
+    ],
+)
+def test_each_part_gets_its_class(scene: Scene, part: int, expected: ObjectClass, share: float) -> None:
+    inside = (scene.truth == part) & ((part == 0) | (scene.xyz[:, 2] > 0.15))
+    assert np.mean(scene.instances.classification[inside] == expected) > share
+
+
+def test_each_object_is_one_instance_of_its_own(scene: Scene) -> None:
+    main = []
+    for part in range(1, 7):
+        number, count = np.unique(
+            scene.instances.instance[(scene.truth == part) & (scene.xyz[:, 2] > 0.15)], return_counts=True
+        )
+        main.append(int(number[np.argmax(count)]))
+        assert count.max() > 0.85 * count.sum(), f"part {part} is in pieces"
+    assert 0 not in main
+    assert len(set(main)) == 6
+
+
+def test_the_ground_is_no_instance(scene: Scene) -> None:
+    assert (scene.instances.instance[scene.instances.classification == ObjectClass.GROUND] == 0).all()
+
+
+def test_clusters_are_linked_chains() -> None:
+    line = np.column_stack([[0.0, 0.5, 1.0, 3.0, 3.4], np.zeros(5), np.zeros(5)])
+    assert euclidean_clusters(line, 0.6).tolist() == [0, 0, 0, 1, 1]
+    reach = np.array([0.6, 0.6, 0.6, 0.6, 0.3])
+    assert euclidean_clusters(line, 0.6, reach).tolist() == [0, 0, 0, 1, 2]
+
+
+def test_dbscan_counts_weights_and_gives_border_points_to_the_nearest_core() -> None:
+    x = np.array([0.0, 0.1, 0.2, 0.8, 5.0, 9.0])
+    points = np.column_stack([x, np.zeros(6), np.zeros(6)])
+    weight = np.array([1, 1, 1, 1, 1, 3], dtype=np.int32)
+    assert dbscan(points, weight, 0.7, 3).tolist() == [0, 0, 0, 0, -1, 1]
+    order = np.array([3, 5, 0, 4, 2, 1])
+    shuffled = dbscan(points[order], weight[order], 0.7, 3)
+    assert (shuffled == -1).tolist() == (dbscan(points, weight, 0.7, 3)[order] == -1).tolist()
+    assert len(set(shuffled[[0, 2, 4, 5]].tolist())) == 1
+
+
+def test_touching_crowns_are_two_trees_and_a_hedge_stays_whole() -> None:
+    rng = np.random.default_rng(2)
+
+    def dome(x: float, top: float) -> FloatArray:
+        xy = rng.uniform(-2.5, 2.5, (1500, 2))
+        return np.column_stack([xy + np.array([x, 0.0]), top - 0.4 * np.sum(xy**2, axis=1)])
+
+    trees = np.concatenate([dome(0, 8), dome(4.5, 7)])
+    found = split_crowns(trees, trees[:, 2], np.zeros(len(trees), np.int32))
+    left, right = found[np.abs(trees[:, 0]) < 1], found[np.abs(trees[:, 0] - 4.5) < 1]
+    assert len(set(left.tolist())) == 1
+    assert len(set(right.tolist())) == 1
+    assert left[0] != right[0]
+    hedge = np.column_stack([rng.uniform(0, 20, 2000), rng.uniform(0, 1, 2000), rng.uniform(0, 1.5, 2000)])
+    assert (split_crowns(hedge, hedge[:, 2], np.zeros(2000, np.int32)) == 0).all()
+
+
+def test_planes_and_their_support() -> None:
+    rng = np.random.default_rng(3)
+    wall = sheet(rng, np.zeros(3), np.array([4.0, 0, 0]), np.array([0, 0, 3.0]))
+    roof = sheet(rng, np.array([0.0, 5, 3]), np.array([4.0, 0, 0]), np.array([0, 2.0, 2.0]))
+    xyz = np.concatenate([wall, roof])
+    groups = Groups(np.repeat([0, 1], [len(wall), len(roof)]), 2)
+    planes = fit_planes(xyz, groups)
+    assert planes.normal[0] == pytest.approx([0, np.sign(planes.normal[0, 1]), 0], abs=0.01)
+    assert planes.normal[1] == pytest.approx([0, -np.sqrt(0.5), np.sqrt(0.5)], abs=0.01)
+    assert planes.rmse == pytest.approx([0.01, 0.01], abs=0.003)
+    assert support_area(xyz, groups, planes, 0.5) == pytest.approx([12.0, 11.3], rel=0.25)
+
+
+def test_segments_that_touch_are_named_once() -> None:
+    xyz = np.column_stack([np.arange(6) * 0.25, np.zeros(6), np.zeros(6)])
+    pairs, contact = touching(xyz, np.array([0, 0, 1, 1, -1, 2], np.int32), 0.3)
+    assert pairs.tolist() == [[0, 1]]
+    assert contact.tolist() == [2]
+    assert merge(np.array([[0, 2], [3, 4]]), 5).tolist() == [0, 1, 0, 2, 2]
