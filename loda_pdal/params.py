@@ -205,6 +205,7 @@ class LodParams(StageParams):
     max_isotropy: float = param(
         0.5, "smallest over middle eigenvalue above which a cell is not valid", low=0.001, high=1
     )
+    small_sample: bool = param(True, "widen the limit where few points make it, so that 95 % stays 95 %")
     low_observability_m: float = param(0.50, "limit where a cell is not valid", unit="m", low=0.01, high=10)
     pose_term: str = param(
         "full",
@@ -398,6 +399,22 @@ class ChangeParams(StageParams):
     )
     backing_voxels: int = param(
         8, "occupancy voxels gained or lost that must back a height or volume cue; 0: none", low=0, high=10000
+    )
+    backing_share: float = param(
+        0.02, "share of the object's voxels that must back a height cue, beyond the other epoch's top", low=0, high=1
+    )
+    min_expected_points: float = param(
+        3.0,
+        "a voxel is empty only where the sampling let this many raw points be expected; 0: always",
+        low=0,
+        high=1000,
+    )
+    replaced_m: float = param(
+        0.25,
+        "height difference or displacement above which a parked vehicle is another one; 0: never",
+        unit="m",
+        low=0,
+        high=10,
     )
     find_parts: bool = param(True, "a change confined to a part becomes its own object (METHOD 2b)")
     part_of_length_m: float = param(
@@ -661,7 +678,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
         "name": "paper",
         "icp": {"covariance": "normal"},
         "ground": {"vertical": "ground"},
-        "lod": {"pose_term": "translation"},
+        "lod": {"pose_term": "translation", "small_sample": False},
         "association": {"boxes": "pca"},
         "superpoints": {"absorb_below": 1},
         "semantics": {
@@ -681,6 +698,9 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "volume_reference": "before",
             "min_support": 1.0,
             "backing_voxels": 0,
+            "backing_share": 0.0,
+            "min_expected_points": 0.0,
+            "replaced_m": 0.0,
         },
     },
 }

@@ -38,13 +38,12 @@ def block(x: float, y: float, length: float, width: float, top: float) -> tuple[
 def surface(*parts: tuple[int, tuple[FloatArray, FloatArray]]) -> Surface:
     """One epoch of numbered parts."""
     if not parts:
-        return Surface(
-            np.zeros((0, 3)), np.zeros((0, 3), np.float32), np.zeros(0), np.zeros(0, np.int32), np.zeros(0, np.int32)
-        )
+        none = np.zeros(0, np.int32)
+        return Surface(np.zeros((0, 3)), np.zeros((0, 3), np.float32), np.zeros(0), none, none, np.zeros(0, np.bool_))
     xyz = np.concatenate([points for _, (points, _) in parts])
     normals = np.concatenate([n for _, (_, n) in parts]).astype(np.float32)
     owner = np.concatenate([np.full(len(points), number, np.int32) for number, (points, _) in parts])
-    return Surface(xyz, normals, xyz[:, 2].copy(), np.ones(len(xyz), np.int32), owner)
+    return Surface(xyz, normals, xyz[:, 2].copy(), np.full(len(xyz), 5, np.int32), owner, np.ones(len(xyz), np.bool_))
 
 
 def lod_everywhere(surfaces: Pair[Surface]) -> LodGrid:
@@ -180,6 +179,7 @@ def test_points_may_come_in_any_order() -> None:
     shuffled = replace(
         after, xyz=after.xyz[order], normals=after.normals[order], height=after.height[order],
         n_raw=after.n_raw[order], owner=after.owner[order],
+        is_surface=after.is_surface[order],
     )  # fmt: skip
     first, second = (decide(surface((0, HOUSE)), side, ObjectClass.BUILDING) for side in (after, shuffled))
     assert first.reason == second.reason

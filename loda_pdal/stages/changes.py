@@ -81,29 +81,36 @@ def decide_changes(
     """
     n = len(object_class)
     seen = coverage if observability.is_enabled or params.visible_only else None
-    parent = np.full(n, -1, dtype=np.int32)
 
     cells = sample_cells(surfaces, seen, lod, params)
     evidence = weigh(cells, surfaces, seen, n, params)
     is_no_pair = np.array([_is_no_pair(cue, params) for cue in _rows(evidence, object_class)], dtype=np.bool_)
+    is_apart = np.zeros(n, np.bool_)
     if is_no_pair.any():
         owner, partner = dissolve(surfaces.map(lambda side: side.owner), is_no_pair, n)
         object_class = np.concatenate([object_class, object_class[partner]])
-        parent = np.concatenate([parent, np.full(len(partner), -1, dtype=np.int32)])
+        is_apart = np.concatenate([is_no_pair, np.ones(len(partner), np.bool_)])
         surfaces = surfaces.join(owner, Surface.owned_by)
         cells = sample_cells(surfaces, seen, lod, params)
+    parent = np.full(len(object_class), -1, dtype=np.int32)
     if params.find_parts:
         parts = split_parts(cells, surfaces, len(object_class), params)
-        object_class = object_class[np.where(parts.parent >= 0, parts.parent, np.arange(len(parts.parent)))]
         parent = parts.parent
+        whole = np.where(parent >= 0, parent, np.arange(len(parent)))
+        object_class, is_apart = object_class[whole], is_apart[whole]
         surfaces = surfaces.join(parts.owner, Surface.owned_by)
-    surfaces, object_class, parent = _renumbered(surfaces, object_class, parent)
+    surfaces, order, parent = _renumbered(surfaces, parent)
+    object_class, is_apart = object_class[order], is_apart[order]
 
     cells = sample_cells(surfaces, seen, lod, params)
     evidence = weigh(cells, surfaces, seen, len(object_class), params)
-    verdicts = [_verdict(cue, params, observability) for cue in _rows(evidence, object_class)]
+    cues = _rows(evidence, object_class)
+    verdicts = [_verdict(cue, apart, params, observability) for cue, apart in zip(cues, is_apart.tolist(), strict=True)]
     raw = np.array(
-        [_raw(cue, v, params, confidence) for cue, v in zip(_rows(evidence, object_class), verdicts, strict=True)]
+        [
+            _raw(cue, v, apart, params, confidence)
+            for cue, v, apart in zip(cues, verdicts, is_apart.tolist(), strict=True)
+        ]
     )
     sure = [calibrated(score, v.label, confidence) for score, v in zip(raw.tolist(), verdicts, strict=True)]
     label = np.array([v.label for v in verdicts], dtype=np.uint8)
@@ -135,9 +142,13 @@ class Cue(NamedTuple):
     dh: float
     dv_ratio: float
     d_perp: float
+    d_typical: float
+    gained_above: float
+    lost_above: float
     lod95: float
     observability: float
     rise: float
+    n_voxels: float
 
 
 class Verdict(NamedTuple):
@@ -153,7 +164,8 @@ def _rows(evidence: Evidence, object_class: ByteArray) -> list[Cue]:
         evidence.n_voxels.after > 0,
         evidence.support.before,
         evidence.support.after,
-        *(getattr(evidence, name) for name in Cue._fields[5:]),
+        *(getattr(evidence, name) for name in Cue._fields[5:-1]),
+        np.fmax(evidence.n_voxels.before, evidence.n_voxels.after),
     )
     return [
         Cue(ObjectClass(code), *values)
@@ -169,7 +181,14 @@ def _is_no_pair(cue: Cue, params: ChangeParams) -> bool:
         return cue.iou <= params.building_iou or (cue.shift >= params.building_shift_m and _is_apart(cue, params))
     if cue.object_class == ObjectClass.VEGETATION:
         return cue.iou <= params.vegetation_iou or (cue.shift >= params.vegetation_shift_m and _is_apart(cue, params))
+    if cue.object_class == ObjectClass.MOBILE and params.replaced_m > 0:
+        is_other_shape = abs(cue.dh) > params.replaced_m or cue.d_typical > params.replaced_m
+        return is_other_shape and min(cue.support_before, cue.support_after) < _SAME_VEHICLE
     return False
+
+
+_SAME_VEHICLE = 0.85
+"""A vehicle of which both surveys share more of the surface than this is the same, whatever its top."""
 
 
 def _is_apart(cue: Cue, params: ChangeParams) -> bool:
@@ -177,9 +196,10 @@ def _is_apart(cue: Cue, params: ChangeParams) -> bool:
     return max(cue.support_before, cue.support_after) < params.min_support
 
 
-def _verdict(cue: Cue, params: ChangeParams, observability: ObservabilityParams) -> Verdict:
+def _verdict(cue: Cue, is_apart: bool, params: ChangeParams, observability: ObservabilityParams) -> Verdict:
+    """Label of one object; ``is_apart``: it was matched, but the pair turned out to be two objects."""
     if not (cue.is_before and cue.is_after):
-        return _unmatched(cue, params, observability)
+        return _unmatched(cue, is_apart, params, observability)
     if observability.is_enabled and cue.observability < observability.min_observability:
         return Verdict(
             ChangeLabel.UNDETERMINED,
@@ -191,7 +211,7 @@ def _verdict(cue: Cue, params: ChangeParams, observability: ObservabilityParams)
     return _pair(cue, params)
 
 
-def _unmatched(cue: Cue, params: ChangeParams, observability: ObservabilityParams) -> Verdict:
+def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: ObservabilityParams) -> Verdict:
     """Objects of one epoch only: not seen, seen under another name, or really Added or Removed."""
     label, other = (ChangeLabel.ADDED, "before") if cue.is_after else (ChangeLabel.REMOVED, "after")
     support = cue.support_after if cue.is_after else cue.support_before
@@ -201,6 +221,8 @@ def _unmatched(cue: Cue, params: ChangeParams, observability: ObservabilityParam
             f"the {other} survey could have seen only {cue.observability:.0%} of it "
             f"(at least {observability.min_observability:.0%} needed)",
         )
+    if is_apart:
+        return Verdict(label, f"something else stands in its place in the {other} survey")
     if support >= params.min_support:
         return Verdict(
             ChangeLabel.UNCHANGED,
@@ -232,14 +254,14 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
     height_m = params.vegetation_height_m if is_green else params.building_height_m
     ratio = params.vegetation_volume_ratio if is_green else params.building_volume_ratio
     gate = params.lod_factor * cue.lod95 if params.use_lod else 0.0
-    is_backed_up = params.backing_voxels == 0 or cue.gained >= max(params.backing_voxels, cue.lost)
-    is_backed_down = params.backing_voxels == 0 or cue.lost >= max(params.backing_voxels, cue.gained)
-    has_height = params.use_height and abs(cue.dh) > gate  # NaN is never above
-    has_volume = params.use_volume and not math.isnan(cue.dv_ratio)
-    rises = has_height and cue.dh > height_m and is_backed_up
-    sinks = has_height and cue.dh < -height_m and is_backed_down
-    swells = has_volume and cue.dv_ratio > ratio and is_backed_up
-    shrinks = has_volume and cue.dv_ratio < -ratio and is_backed_down
+    least = params.backing_voxels
+    least_above = max(least, params.backing_share * cue.n_voxels)
+    has_height = params.use_height and abs(cue.dh) > max(gate, height_m)  # NaN is never above
+    has_volume = params.use_volume and abs(cue.dv_ratio) > ratio
+    rises = has_height and cue.dh > 0 and (least == 0 or cue.gained_above >= least_above)
+    sinks = has_height and cue.dh < 0 and (least == 0 or cue.lost_above >= least_above)
+    swells = has_volume and cue.dv_ratio > 0 and (least == 0 or cue.gained >= max(least, cue.lost))
+    shrinks = has_volume and cue.dv_ratio < 0 and (least == 0 or cue.lost >= max(least, cue.gained))
     figures = _figures(cue, height_m, ratio, gate)
     if (rises or swells) and (sinks or shrinks):
         if math.isnan(cue.rise) or cue.rise == 0:
@@ -276,7 +298,7 @@ def _figures(cue: Cue, height_m: float, ratio: float, gate: float) -> str:
     return ", ".join([*parts, f"IoU {cue.iou:.2f}"])
 
 
-def _raw(cue: Cue, verdict: Verdict, params: ChangeParams, confidence: ConfidenceParams) -> float:
+def _raw(cue: Cue, verdict: Verdict, is_apart: bool, params: ChangeParams, confidence: ConfidenceParams) -> float:
     is_green = cue.object_class == ObjectClass.VEGETATION
     height_m = params.vegetation_height_m if is_green else params.building_height_m
     ratio = params.vegetation_volume_ratio if is_green else params.building_volume_ratio
@@ -288,25 +310,26 @@ def _raw(cue: Cue, verdict: Verdict, params: ChangeParams, confidence: Confidenc
         overlap=cue.iou,
         shift=cue.shift / max(shift_m, 1e-9),
         displacement=cue.d_perp / max(params.lod_factor * cue.lod95, params.displacement_m, 1e-9),
-        support=cue.support_after if cue.is_after else cue.support_before,
+        support=0.0 if is_apart else cue.support_after if cue.is_after else cue.support_before,
         observability=cue.observability,
         params=confidence,
     )
 
 
-def _renumbered(
-    surfaces: Pair[Surface], object_class: ByteArray, parent: IntArray
-) -> tuple[Pair[Surface], ByteArray, IntArray]:
-    """Drop objects that lost all their points to parts and number the others by place."""
-    n = len(object_class)
+def _renumbered(surfaces: Pair[Surface], parent: IntArray) -> tuple[Pair[Surface], IntArray, IntArray]:
+    """Number objects by place and drop those that lost all their points to parts.
+
+    Returns the surfaces, the old number of each object, and the parents in new numbers.
+    """
+    n = len(parent)
     owner = surfaces.map(lambda side: side.owner)
     rank = rank_by_place(surfaces.map(lambda side: side.xyz), owner, n)
     is_used = np.zeros(n, np.bool_)
     for side in owner:
         is_used[side[side >= 0]] = True
     order = np.argsort(rank)
-    order = order[is_used[order]]
+    order = order[is_used[order]].astype(np.int32)
     number = np.full(n + 1, -1, dtype=np.int32)
     number[order] = np.arange(len(order), dtype=np.int32)
     surfaces = surfaces.join(owner.map(lambda side: number[side]), Surface.owned_by)
-    return surfaces, object_class[order], np.where(parent[order] >= 0, number[parent[order]], -1).astype(np.int32)
+    return surfaces, order, number[parent[order]]

@@ -7,8 +7,10 @@ in each epoch, whether the other epoch has a surface in reach, and whether the o
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from loda_pdal.kernels.neighbours import nearest
 from loda_pdal.model.cloud import BoolArray, Float32Array, FloatArray, Int64Array, IntArray
@@ -36,6 +38,8 @@ class Surface:
         Raw points in each.
     owner : (m,) int32
         Object of each point, -1 none.
+    is_surface : (m,) bool
+        Whether the point is evidence that something stands there: all but ground, fragments without object included.
     """
 
     xyz: FloatArray
@@ -43,6 +47,7 @@ class Surface:
     height: FloatArray
     n_raw: IntArray
     owner: IntArray
+    is_surface: BoolArray
 
     def owned_by(self, owner: IntArray) -> Surface:
         """The same points with other owners (m,)."""
@@ -59,10 +64,12 @@ class Cells:
         Lattice index, lexicographically sorted, unique.
     owner : Pair of (c,) int32
         Object whose points occupy the voxel in that epoch, -1 where none.
+    n_raw : Pair of (c,) float64
+        Raw points of that object in the voxel.
     is_near : Pair of (c,) bool
-        Whether that epoch has an object's surface within the query radius of the centre.
+        Whether that epoch has a surface within the query radius of the centre.
     is_seen : Pair of (c,) bool
-        Whether that epoch saw the voxel's column.
+        Whether that epoch saw the voxel's column, and would have hit what the other epoch shows there.
     displacement : (c,) float64, m
         Along the mean normal, after minus before (equation 5); NaN where either surface is missing.
     lod95 : (c,) float64, m
@@ -71,6 +78,7 @@ class Cells:
 
     cell: Int64Array
     owner: Pair[IntArray]
+    n_raw: Pair[FloatArray]
     is_near: Pair[BoolArray]
     is_seen: Pair[BoolArray]
     displacement: FloatArray
@@ -96,10 +104,32 @@ class Cells:
 class Evidence:
     """The cues of every object, (n,) each; NaN where a cue cannot be had.
 
-    ``volume`` m3 of occupied voxels, ``height`` m above ground (95th percentile), ``support`` share of an epoch's
-    voxels that the other epoch shows too, ``gained`` and ``lost`` numbers of voxels, ``observability`` share of the
-    voxels that both surveys saw or could have seen, ``rise`` m by which the mean height of occupancy inside the
-    overlap moves up.
+    Attributes
+    ----------
+    n_points, n_voxels : Pair
+        Raw points and occupied voxels of each epoch.
+    volume : Pair, m3
+        Of the voxels that are compared; ``dv`` is their change and ``dv_ratio`` that change over the reference volume.
+    height : Pair, m
+        95th percentile of height above the ground of each epoch.
+    support : Pair
+        Share of an epoch's voxels that the other epoch shows too.
+    gained, lost
+        Voxels that only the after, or only the before epoch has, where the other could have seen them;
+        ``gained_above`` and ``lost_above`` are those beyond the other epoch's top.
+    iou, shift : 3D overlap of the occupancy, and distance of the centroids (m).
+    dh : m
+        Change of the height that the parameters name.
+    d_perp, d_typical : m
+        Median signed and median absolute displacement along the normal.
+    lod95 : m
+        Median limit of detection.
+    observability
+        Share of the voxels that both surveys saw or could have seen.
+    rise : m
+        How far the mean height of occupancy moves up inside the overlap.
+    z_min, z_max : m
+        Lowest and highest point of either epoch, in the analysis frame.
     """
 
     n_points: Pair[FloatArray]
@@ -115,7 +145,9 @@ class Evidence:
     dv: FloatArray
     dv_ratio: FloatArray
     d_perp: FloatArray
-    n_samples: FloatArray
+    d_typical: FloatArray
+    gained_above: FloatArray
+    lost_above: FloatArray
     lod95: FloatArray
     observability: FloatArray
     rise: FloatArray
@@ -129,20 +161,41 @@ def sample_cells(surfaces: Pair[Surface], coverage: Pair[Coverage] | None, lod: 
     Without ``coverage`` every voxel counts as seen by both surveys, as in the paper.
     """
     occupied = surfaces.map(lambda surface: _owned_cells(surface, params.voxel_m))
-    rows = np.concatenate([occupied.before[0], occupied.after[0]])
+    rows = np.concatenate([occupied.before.cell, occupied.after.cell])
     if len(rows) == 0:
         nothing, never, no = np.zeros(0, np.int32), np.zeros(0, np.bool_), np.zeros(0)
-        return Cells(rows, Pair(nothing, nothing), Pair(never, never), Pair(never, never), no, no)
+        return Cells(rows, Pair(nothing, nothing), Pair(no, no), Pair(never, never), Pair(never, never), no, no)
     lattice = Lattice.around(rows)
     keys, first = np.unique(lattice.keys(rows), return_index=True)
     cell = rows[first]
-    owner = occupied.map(lambda side: _spread(lattice, keys, *side))
+    owner = occupied.map(lambda side: _spread(lattice, keys, side.cell, side.owner, -1))
+    n_raw = occupied.map(lambda side: _spread(lattice, keys, side.cell, side.n_raw, 0.0))
     centre = (cell + 0.5) * params.voxel_m
     found = surfaces.map(lambda surface: _nearest_surface(surface, centre, params.query_radius_m))
     is_near = found.map(lambda idx: idx >= 0)
     always = np.ones(len(cell), np.bool_)
     is_seen = coverage.map(lambda side: side.at(centre)) if coverage else Pair(always, always)
-    return Cells(cell, owner, is_near, is_seen, _displacement(surfaces, found), lod.at(centre))
+    if params.min_expected_points > 0:
+        expected = _expected_points(owner, n_raw)
+        is_hit = expected.map(lambda points: points >= params.min_expected_points)
+        is_seen = is_seen.join(is_hit, lambda seen, hit: seen & hit)
+    return Cells(cell, owner, n_raw, is_near, is_seen, _displacement(surfaces, found), lod.at(centre))
+
+
+def _expected_points(owner: Pair[IntArray], n_raw: Pair[FloatArray]) -> Pair[FloatArray]:
+    """Raw points (c,) that each epoch should have in a voxel that the other occupies, were the object unchanged.
+
+    From the other epoch's points there and the ratio of both epochs' points in the voxels of the object that both
+    occupy; an object without such voxels is expected to be sampled alike by both.
+    """
+    n = int(max(owner.before.max(), owner.after.max())) + 1
+    is_both = (owner.before >= 0) & (owner.before == owner.after)
+    shared = n_raw.map(lambda points: np.bincount(owner.before[is_both], weights=points[is_both], minlength=n) + 1.0)
+    ratio = np.append(shared.before / shared.after, 1.0)
+    return Pair(
+        np.where(owner.after >= 0, n_raw.after * ratio[owner.after], np.inf),
+        np.where(owner.before >= 0, n_raw.before / ratio[owner.before], np.inf),
+    )
 
 
 def weigh(
@@ -175,11 +228,13 @@ def weigh(
     base = volume.before if params.volume_reference == "before" else (volume.before + volume.after) / 2
 
     samples = Groups(np.where(np.isfinite(cells.displacement[voxel]), owner, -1), n)
+    is_sampled = samples.counts >= params.min_samples
     points = surfaces.map(lambda surface: Groups(surface.owner, n))
     lowest = points.join(surfaces, lambda group, surface: group.minimum(surface.xyz[:, 2]))
     highest = points.join(surfaces, lambda group, surface: group.maximum(surface.xyz[:, 2]))
     height = points.join(surfaces, lambda group, surface: group.quantile(surface.height, 0.95))
-    top = height if params.height_reference == "ground" else _tops(surfaces, coverage, n, params.voxel_m)
+    summit = _tops(surfaces, coverage, n, params.voxel_m)
+    top = height if params.height_reference == "ground" else summit
     middle = (cells.cell + 0.5) * params.voxel_m
     centroid = own.join(is_known, lambda side, known: Groups(np.where(known, side, -1), n).mean(middle))
     return Evidence(
@@ -195,8 +250,10 @@ def weigh(
         dh=top.after - top.before,
         dv=dv,
         dv_ratio=np.divide(dv, base, out=np.full(n, np.nan), where=base > 0),
-        d_perp=np.where(samples.counts >= params.min_samples, samples.median(cells.displacement[voxel]), np.nan),
-        n_samples=samples.counts.astype(np.float64),
+        d_perp=np.where(is_sampled, samples.median(cells.displacement[voxel]), np.nan),
+        d_typical=np.where(is_sampled, samples.median(np.abs(cells.displacement[voxel])), np.nan),
+        gained_above=_count(own.after, cells.is_gained & _is_above(middle[:, 2], own.after, summit.before), n),
+        lost_above=_count(own.before, cells.is_lost & _is_above(middle[:, 2], own.before, summit.after), n),
         lod95=Groups(owner, n).median(cells.lod95[voxel]),
         observability=(n_known.before + n_known.after) / np.maximum(n_voxels.before + n_voxels.after, 1),
         rise=_rise(cells, middle[:, 2], n),
@@ -218,25 +275,37 @@ def _either(cells: Cells) -> tuple[Int64Array, IntArray]:
     return np.concatenate([before, after]), owner.astype(np.int32)
 
 
-def _owned_cells(surface: Surface, voxel_m: float) -> tuple[Int64Array, IntArray]:
-    """Voxels (k, 3) that an epoch's objects occupy and their owners (k,); the lowest object where several meet."""
+class _Occupied(NamedTuple):
+    """Voxels (k, 3) that an epoch's objects occupy, their owners and the owners' raw points in them (k,)."""
+
+    cell: Int64Array
+    owner: IntArray
+    n_raw: FloatArray
+
+
+def _owned_cells(surface: Surface, voxel_m: float) -> _Occupied:
+    """Voxels that an epoch's objects occupy; the lowest object where several meet."""
     is_member = surface.owner >= 0
-    rows = unique_rows(np.column_stack([cells_of(surface.xyz[is_member], voxel_m), surface.owner[is_member]]))
+    rows = np.column_stack([cells_of(surface.xyz[is_member], voxel_m), surface.owner[is_member]])
+    points = np.bincount(unique_inverse(rows), weights=surface.n_raw[is_member])
+    rows = unique_rows(rows)
     is_first = np.ones(len(rows), np.bool_)
     is_first[1:] = np.any(rows[1:, :3] != rows[:-1, :3], axis=1)
-    return rows[is_first, :3], rows[is_first, 3].astype(np.int32)
+    return _Occupied(rows[is_first, :3], rows[is_first, 3].astype(np.int32), points[is_first])
 
 
-def _spread(lattice: Lattice, keys: Int64Array, cell: Int64Array, owner: IntArray) -> IntArray:
-    """Owners on the joint list of voxels, -1 where the epoch has none."""
-    spread = np.full(len(keys), -1, dtype=np.int32)
-    spread[lattice.find(keys, cell)] = owner
+def _spread(
+    lattice: Lattice, keys: Int64Array, cell: Int64Array, values: npt.NDArray[Any], unknown: float
+) -> npt.NDArray[Any]:
+    """Values of an epoch's voxels on the joint list of voxels."""
+    spread = np.full(len(keys), unknown, dtype=values.dtype)
+    spread[lattice.find(keys, cell)] = values
     return spread
 
 
 def _nearest_surface(surface: Surface, centre: FloatArray, reach_m: float) -> IntArray:
-    """Index of the object point nearest to each centre, -1 where none lies within ``reach_m``."""
-    members = np.flatnonzero(surface.owner >= 0)
+    """Index of the surface point nearest to each centre, -1 where none lies within ``reach_m``."""
+    members = np.flatnonzero(surface.is_surface)
     if len(members) == 0:
         return np.full(len(centre), -1, dtype=np.int32)
     found, _ = nearest(surface.xyz[members], centre, reach_m)
@@ -279,6 +348,11 @@ def _tops(surfaces: Pair[Surface], coverage: Pair[Coverage] | None, n: int, cell
         top(surfaces.before, coverage.after if coverage else None),
         top(surfaces.after, coverage.before if coverage else None),
     )
+
+
+def _is_above(z: FloatArray, owner: IntArray, top: FloatArray) -> BoolArray:
+    """Whether each voxel (c,) lies above the given top of its owner; never where there is no owner or no top."""
+    return np.asarray(z > np.append(top, np.nan)[owner])
 
 
 def _rise(cells: Cells, z: FloatArray, n: int) -> FloatArray:

@@ -1,27 +1,34 @@
-"""The unit of change: a change confined to a part of a long object becomes an object of its own (METHOD 2b)."""
+"""The unit of change: what changed in a part of an object only becomes an object of its own (METHOD 2b)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+import shapely
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from loda_pdal.model.boxes import upright_boxes
 from loda_pdal.model.cloud import BoolArray, Int64Array, IntArray
 from loda_pdal.model.grid import Lattice, cells_of
-from loda_pdal.model.groups import unique_rows
+from loda_pdal.model.groups import Groups, unique_rows
 from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams
 from loda_pdal.stages.cues import Cells, Surface
 
-_HALF_NEIGHBOURS = np.array([d for d in np.ndindex(3, 3, 3) if d > (1, 1, 1)], dtype=np.int64) - 1
+_LINK_VOXELS = 2.9
+"""Changed voxels this far apart, in voxels, are one region: the rays of a vehicle leave stripes."""
+
+_MOST_OF = 0.5
+"""A region that takes more than this share of an object's columns is no part of it: the object itself changed."""
 
 
 @dataclass(frozen=True)
 class Parts:
-    """Owners after parts were taken out of long objects.
+    """Owners after parts were taken out of objects.
 
     Attributes
     ----------
@@ -35,28 +42,43 @@ class Parts:
     parent: IntArray
 
 
-def split_parts(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -> Parts:
-    """Take connected gained or lost regions, with all that stands in their columns, out of objects they do not fill.
+class _Region(NamedTuple):
+    parent: int
+    columns: Int64Array
+    n_voxels: int
 
-    A region is connected (26 neighbours) among the gained, or among the lost, voxels of one object; its columns go to
-    the largest region that claims them. Objects shorter than ``part_of_length_m``, and objects of which a region would
-    take more than half the columns, stay whole.
+
+def split_parts(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -> Parts:
+    """Take what changed out of long objects, and what did not out of objects that only one epoch has.
+
+    A terrace is one object, but one of its houses may have a new storey: a connected region of gained, or of lost,
+    voxels becomes a part, with all that stands in the columns under its outline. And where a new house was built
+    against a shed, the two are one new object: the region that the other epoch shows too becomes a part.
+
+    Objects shorter than ``part_of_length_m`` that both epochs have stay whole, and so does an object of which a
+    region takes most columns.
     """
     owner = surfaces.map(lambda surface: surface.owner)
-    whole = Parts(owner, np.full(n, -1, dtype=np.int32))
+    nobody = np.full(n, -1, dtype=np.int32)
     if n == 0 or len(cells.cell) == 0:
-        return whole
+        return Parts(owner, nobody)
+    is_present = owner.map(lambda side: np.isin(np.arange(n), side))
+    is_pair = is_present.before & is_present.after
     xyz = np.concatenate([surface.xyz for surface in surfaces])
     size = upright_boxes(xyz, np.concatenate(list(owner)), n).size
-    in_both = np.isin(np.arange(n), owner.before) & np.isin(np.arange(n), owner.after)
-    is_long = in_both & (np.maximum(size[:, 0], size[:, 1]) > params.part_of_length_m)
-    columns = _claimed_columns(cells, is_long, params.part_min_voxels)
-    if not columns:
-        return whole
-    rows = np.array([(parent, ix, iy) for parent, ix, iy in columns], dtype=np.int64)
-    part = np.array(list(columns.values()), dtype=np.int64)
-    lattice = Lattice.around(rows)
-    keys = lattice.keys(rows)
+    is_long = is_pair & (np.fmax(size[:, 0], size[:, 1]) > params.part_of_length_m)
+    own = cells.owner
+    regions = [
+        *_regions(cells, own.before, cells.is_lost, is_long, params),
+        *_regions(cells, own.after, cells.is_gained, is_long, params),
+        *_regions(cells, own.before, cells.is_near.after, ~is_pair, params),
+        *_regions(cells, own.after, cells.is_near.before, ~is_pair, params),
+    ]
+    columns, part, parent = _claim(regions, _columns_of(cells, n))
+    if len(parent) == 0:
+        return Parts(owner, nobody)
+    lattice = Lattice.around(columns)
+    keys = lattice.keys(columns)
     order = np.argsort(keys)
     keys, part = keys[order], part[order]
 
@@ -65,51 +87,7 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangePar
         found = lattice.find(keys, row)
         return np.where(found >= 0, n + part[np.maximum(found, 0)], surface.owner).astype(np.int32)
 
-    parent = np.full(int(part.max()) + 1, -1, dtype=np.int32)
-    parent[list(columns.values())] = [key[0] for key in columns]
-    return Parts(surfaces.map(taken), np.concatenate([whole.parent, parent]))
-
-
-def _claimed_columns(cells: Cells, is_long: BoolArray, min_voxels: int) -> dict[tuple[int, int, int], int]:
-    """Part number of each claimed column ``(object, ix, iy)``."""
-    regions: list[tuple[int, int, Int64Array]] = []
-    for owner, is_changed in ((cells.owner.before, cells.is_lost), (cells.owner.after, cells.is_gained)):
-        members = np.flatnonzero(is_changed & is_long[np.maximum(owner, 0)] & (owner >= 0))
-        if len(members) == 0:
-            continue
-        region = _connected(cells.cell[members], owner[members])
-        for index in range(int(region.max()) + 1):
-            inside = members[region == index]
-            if len(inside) >= min_voxels:
-                regions.append((int(owner[inside[0]]), len(inside), np.unique(cells.cell[inside, :2], axis=0)))
-    regions.sort(key=lambda item: (-item[1], item[0], item[2][0].tolist()))
-    owned = [np.column_stack([side, cells.cell[:, :2]])[side >= 0] for side in cells.owner]
-    n_columns = np.bincount(unique_rows(np.concatenate(owned))[:, 0], minlength=len(is_long))
-    claimed: dict[tuple[int, int, int], int] = {}
-    n_parts = 0
-    for parent, _, plan in regions:
-        free = [(parent, x, y) for x, y in plan.tolist() if (parent, x, y) not in claimed]
-        if not free or len(plan) > 0.5 * n_columns[parent]:
-            continue
-        claimed.update(dict.fromkeys(free, n_parts))
-        n_parts += 1
-    return claimed
-
-
-def _connected(cell: Int64Array, owner: IntArray) -> IntArray:
-    """26-connected components (k,) of voxels of one owner."""
-    lattice = Lattice.around(cell)
-    keys = lattice.keys(cell)
-    edges = []
-    for step in _HALF_NEIGHBOURS:
-        found = lattice.find(keys, cell + step)
-        source = np.flatnonzero(found >= 0)
-        target = found[source]
-        is_same = owner[source] == owner[target]
-        edges.append(np.column_stack([source[is_same], target[is_same]]))
-    pairs = np.concatenate(edges)
-    graph = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(len(cell),) * 2)
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int32)
+    return Parts(surfaces.map(taken), np.concatenate([nobody, parent]))
 
 
 def dissolve(owner: Pair[IntArray], is_dissolved: BoolArray, n: int) -> tuple[Pair[IntArray], IntArray]:
@@ -122,3 +100,52 @@ def dissolve(owner: Pair[IntArray], is_dissolved: BoolArray, n: int) -> tuple[Pa
     number[partner] = n + np.arange(len(partner), dtype=np.int32)
     after = np.where(owner.after >= 0, number[np.maximum(owner.after, 0)], -1).astype(np.int32)
     return Pair(owner.before, after), partner
+
+
+def _columns_of(cells: Cells, n: int) -> tuple[Int64Array, Int64Array]:
+    """All columns (k, 3) of all objects as rows (object, ix, iy), sorted, and where each object's begin (n + 1,)."""
+    owned = [np.column_stack([side, cells.cell[:, :2]])[side >= 0] for side in cells.owner]
+    rows = unique_rows(np.concatenate(owned).astype(np.int64))
+    return rows, np.searchsorted(rows[:, 0], np.arange(n + 1))
+
+
+def _regions(
+    cells: Cells, owner: IntArray, is_in: BoolArray, is_split: BoolArray, params: ChangeParams
+) -> list[_Region]:
+    """Connected regions of the marked voxels within one object."""
+    members = np.flatnonzero(is_in & (owner >= 0) & is_split[np.maximum(owner, 0)])
+    if len(members) == 0:
+        return []
+    # one tree for all objects: a fourth coordinate keeps them apart
+    place = np.column_stack([cells.cell[members], owner[members].astype(np.int64) * 10])
+    links = cKDTree(place).query_pairs(_LINK_VOXELS, output_type="ndarray")
+    graph = coo_array((np.ones(len(links), np.int8), (links[:, 0], links[:, 1])), shape=(len(members),) * 2)
+    region = connected_components(graph, directed=False)[1]
+    groups = Groups(region, int(region.max()) + 1)
+    found = []
+    for index in np.flatnonzero(groups.counts >= params.part_min_voxels).tolist():
+        inside = members[groups.members(index)]
+        plan = unique_rows(cells.cell[inside, :2])
+        found.append(_Region(int(owner[inside[0]]), plan, len(inside)))
+    return found
+
+
+def _claim(
+    regions: list[_Region], columns_of: tuple[Int64Array, Int64Array]
+) -> tuple[Int64Array, Int64Array, IntArray]:
+    """Columns (k, 3) that parts take, the part of each, and the parent of each part; the largest region comes first."""
+    rows, start = columns_of
+    part_of = np.full(len(rows), -1, dtype=np.int64)
+    parents: list[int] = []
+    for region in sorted(regions, key=lambda r: (-r.n_voxels, r.parent, r.columns[0].tolist())):
+        first, last = start[region.parent], start[region.parent + 1]
+        outline = shapely.convex_hull(shapely.MultiPoint(region.columns + 0.5)).buffer(1.0)
+        is_inside = shapely.contains_xy(outline, rows[first:last, 1] + 0.5, rows[first:last, 2] + 0.5)
+        if np.count_nonzero(is_inside) > _MOST_OF * (last - first):
+            continue
+        is_free = is_inside & (part_of[first:last] < 0)
+        if is_free.any():
+            part_of[first:last][is_free] = len(parents)
+            parents.append(region.parent)
+    is_claimed = part_of >= 0
+    return rows[is_claimed], part_of[is_claimed], np.array(parents, dtype=np.int32)
