@@ -212,6 +212,11 @@ class LodParams(StageParams):
         "pose covariance in the limit: full 6x6, translation only, or none",
         choices=("full", "translation", "none"),
     )
+    drift_term: str = param(
+        "measured",
+        "what the surveys disagree by beyond noise and pose, on surfaces that mostly did not change, or nothing",
+        choices=("measured", "none"),
+    )
     variation: str = param("spatial", "limit per cell, or one number for the map", choices=("spatial", "global"))
 
 
@@ -678,7 +683,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
         "name": "paper",
         "icp": {"covariance": "normal"},
         "ground": {"vertical": "ground"},
-        "lod": {"pose_term": "translation", "small_sample": False},
+        "lod": {"pose_term": "translation", "small_sample": False, "drift_term": "none"},
         "association": {"boxes": "pca"},
         "superpoints": {"absorb_below": 1},
         "semantics": {
