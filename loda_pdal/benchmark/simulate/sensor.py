@@ -1,0 +1,231 @@
+"""A spinning multi-beam LiDAR on a vehicle that drives past the scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from loda_pdal.benchmark.simulate.raycast import RayCaster, normals_of
+from loda_pdal.benchmark.simulate.scene import Terrain
+from loda_pdal.benchmark.simulate.shapes import REFLECTANCE, RETURN_SHARE, Shape
+from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array
+from loda_pdal.model.transform import rotation_matrix
+
+GRAZING_COSINE = 0.06
+"""Below this cosine of the angle of incidence pulses get lost, in proportion."""
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """The scanner, its mounting and its errors.
+
+    ``column_share`` is the share of the scanner's columns that is fired: 1 is every pulse of the real thing, the
+    default keeps a block small enough for a test and still dense enough for every stage.
+    """
+
+    n_beams: int = 128
+    n_azimuths: int = 1024
+    rotation_hz: float = 10.0
+    vertical_deg: float = 22.5
+    height_m: float = 2.0
+    max_range_m: float = 80.0
+    noise_m: float = 0.02
+    dropout: float = 0.02
+    speed_m_s: float = 5.0
+    drift_m: float = 0.02
+    drift_deg: float = 0.03
+    column_share: float = 0.018
+
+
+class Drive(NamedTuple):
+    """Where the scanner was when it fired, in the street's frame.
+
+    Attributes
+    ----------
+    time : (c,) float64, s
+        Of each column, since the survey began.
+    position : (c, 3) float64, m
+        True position of the scanner.
+    heading : (c,) float64, rad
+        True heading of the vehicle.
+    shift, turn : (c, 3) float64, m and rad
+        Error of the recorded pose: recorded = shift + position, turned by ``turn`` (a rotation vector).
+    """
+
+    time: FloatArray
+    position: FloatArray
+    heading: FloatArray
+    shift: FloatArray
+    turn: FloatArray
+
+    @property
+    def recorded(self) -> FloatArray:
+        """Positions as the survey reports them, (c, 3) m."""
+        return self.position + self.shift
+
+
+class Scan(NamedTuple):
+    """Returns of one survey, in the order in which they were measured.
+
+    Attributes
+    ----------
+    xyz : (n, 3) float64, m
+        As reported, with range noise and pose error, in the street's frame.
+    primitive : (n,) int64
+        Which primitive of the scene was hit.
+    time : (n,) float64, s
+        Since the survey began.
+    intensity : (n,) uint16
+        Strength of the return.
+    """
+
+    xyz: FloatArray
+    primitive: Int64Array
+    time: FloatArray
+    intensity: npt.NDArray[np.uint16]
+
+
+def drive(
+    sensor: Sensor, terrain: Terrain, lanes: tuple[float, ...], lead_m: float, random: np.random.Generator
+) -> Drive:
+    """One pass per lane (y of each, m), there and back, from ``lead_m`` before the street to ``lead_m`` after it."""
+    passes = [_pass(sensor, terrain, lane, i, lead_m, random) for i, lane in enumerate(lanes)]
+    return Drive(*(np.concatenate(parts) for parts in zip(*passes, strict=True)))
+
+
+def _pass(
+    sensor: Sensor, terrain: Terrain, lane: float, index: int, lead_m: float, random: np.random.Generator
+) -> Drive:
+    """One drive along the street; right-hand lanes (y < 0) go towards +x."""
+    length = terrain.length + 2 * lead_m
+    duration = length / sensor.speed_m_s
+    n_columns = max(int(duration * sensor.rotation_hz * sensor.n_azimuths * sensor.column_share), 1)
+    step = duration * sensor.rotation_hz * sensor.n_azimuths / n_columns
+    column = np.floor((np.arange(n_columns) + random.random(n_columns)) * step)
+    time = column / (sensor.rotation_hz * sensor.n_azimuths)
+    along = sensor.speed_m_s * time - lead_m
+    direction = 1.0 if lane < 0 else -1.0
+    x = along if lane < 0 else terrain.length - along
+    y = lane + 0.15 * np.sin(2 * np.pi * x / 55.0 + index)
+    z = terrain.height(x, y) + sensor.height_m + 0.01 * np.sin(2 * np.pi * 1.4 * time)
+    heading = np.full(n_columns, 0.0 if direction > 0 else np.pi) + 0.15 * 2 * np.pi / 55.0 * np.cos(
+        2 * np.pi * x / 55.0 + index
+    )
+    shift = _wander(time, sensor.drift_m, random)
+    turn = _wander(time, np.radians(sensor.drift_deg), random)
+    start = index * (duration + 60.0)
+    return Drive(time + start, np.stack([x, y, z], axis=1), heading, shift, turn)
+
+
+def _wander(time: FloatArray, rms: float, random: np.random.Generator) -> FloatArray:
+    """Slow random motion along three axes with about that root mean square and no mean, (c, 3): waves of 9 to 60 s."""
+    total = np.zeros((len(time), 3))
+    for _ in range(3):
+        period, phase = random.uniform(9.0, 60.0, 3), random.uniform(0, 2 * np.pi, 3)
+        total += random.normal(0.0, 0.8, 3) * np.sin(2 * np.pi * time[:, None] / period + phase)
+    return np.asarray(rms * (total - total.mean(axis=0)))
+
+
+def scan(sensor: Sensor, scene: Shape, path: Drive, random: np.random.Generator) -> Scan:
+    """What the sensor reports of ``scene`` along ``path``."""
+    caster, normals = RayCaster(scene), normals_of(scene)
+    columns = np.arange(len(path.time))
+    parts = [
+        _scan_columns(sensor, scene, caster, normals, path, columns[start : start + _COLUMNS_AT_ONCE], random)
+        for start in range(0, max(len(columns), 1), _COLUMNS_AT_ONCE)
+    ]
+    xyz, primitive, time, intensity = zip(*parts, strict=True)
+    return Scan(np.concatenate(xyz), np.concatenate(primitive), np.concatenate(time), np.concatenate(intensity))
+
+
+_COLUMNS_AT_ONCE = 8192
+"""Columns whose rays are held in memory together."""
+
+
+def _scan_columns(
+    sensor: Sensor,
+    scene: Shape,
+    caster: RayCaster,
+    normals: FloatArray,
+    path: Drive,
+    columns: Int64Array,
+    random: np.random.Generator,
+) -> Scan:
+    """Returns of some columns of the drive."""
+    column = np.repeat(columns, sensor.n_beams)
+    directions = _turned(_beam_directions(sensor, path.time[columns]), path.heading[column])
+    hits = caster.cast(path.position[column], directions, sensor.max_range_m)
+    noise = random.normal(0.0, sensor.noise_m, len(column))
+    luck, speckle = random.random(len(column)), random.normal(1.0, 0.08, len(column))
+
+    hit = np.flatnonzero(hits.primitive >= 0)
+    cosine = np.abs(np.sum(normals[hits.primitive[hit]] * directions[hit], axis=1))
+    share = RETURN_SHARE[scene.material[hits.primitive[hit]]] * (1.0 - sensor.dropout)
+    is_returned = luck[hit] < share * np.clip(cosine / GRAZING_COSINE, 0.0, 1.0)
+    kept, cosine = hit[is_returned], cosine[is_returned]
+
+    pose, range_m, primitive = column[kept], hits.range_m[kept], hits.primitive[kept].astype(np.int64)
+    measured = directions[kept] * (range_m + noise[kept])[:, None]
+    xyz = path.recorded[pose] + measured + np.cross(path.turn[pose], measured)
+    brightness = REFLECTANCE[scene.material[primitive]] * cosine / (1.0 + (range_m / 40.0) ** 2)
+    intensity = np.clip(60000.0 * brightness * speckle[kept], 1, 65535).astype(np.uint16)
+    return Scan(xyz, primitive, path.time[pose], intensity)
+
+
+def sees(
+    sensor: Sensor,
+    caster: RayCaster,
+    path: Drive,
+    targets: FloatArray,
+    see_through: BoolArray,
+    station_m: float = 6.0,
+    margin_m: float = 0.15,
+) -> BoolArray:
+    """Which of ``targets`` (k, 3) m the survey could measure, (k,).
+
+    A target counts when it is in range and in the field of view of at least one place of the drive (one is tried
+    every ``station_m``), and the first thing that a ray towards it meets is nearer than ``margin_m`` to it, or beyond,
+    or one of the primitives of ``see_through`` (p,): something that stands in its very place.
+    """
+    n_stations = int(np.ceil(np.linalg.norm(np.diff(path.position, axis=0), axis=1).sum() / station_m)) + 1
+    station = np.unique(np.linspace(0, len(path.time) - 1, n_stations).astype(int))
+    origins = np.repeat(path.position[station], len(targets), axis=0)
+    offset = np.tile(targets, (len(station), 1)) - origins
+    distance = np.linalg.norm(offset, axis=1)
+    directions = offset / np.maximum(distance, 1e-9)[:, None]
+    elevation = np.degrees(np.arcsin(np.clip(directions[:, 2], -1, 1)))
+    candidate = np.flatnonzero((distance < sensor.max_range_m) & (np.abs(elevation) <= sensor.vertical_deg))
+    hits = caster.cast(origins[candidate], directions[candidate], np.maximum(distance[candidate] - margin_m, 0.0))
+    is_seen = np.zeros(len(offset), dtype=bool)
+    is_seen[candidate] = (hits.primitive < 0) | see_through[hits.primitive]
+    return np.asarray(is_seen.reshape(len(station), -1).any(axis=0))
+
+
+def _beam_directions(sensor: Sensor, time: FloatArray) -> FloatArray:
+    """Unit directions of all beams of columns fired at ``time``, in the vehicle's frame, (c * n_beams, 3)."""
+    elevation = np.radians(np.linspace(-sensor.vertical_deg, sensor.vertical_deg, sensor.n_beams))
+    azimuth = 2 * np.pi * np.mod(time * sensor.rotation_hz, 1.0)
+    # the beams of a column do not fire in one plane: four banks look a little aside, as those of real scanners do
+    bank = np.radians(360.0 / sensor.n_azimuths) * (np.arange(sensor.n_beams) % 4 - 1.5) * 3.0
+    angle = azimuth[:, None] + bank
+    flat = np.broadcast_to(np.cos(elevation), angle.shape)
+    up = np.broadcast_to(np.sin(elevation), angle.shape)
+    return np.stack([flat * np.cos(angle), flat * np.sin(angle), up], axis=2).reshape(-1, 3)
+
+
+def _turned(vectors: FloatArray, yaw: FloatArray) -> FloatArray:
+    """``vectors`` (m, 3) turned about z by ``yaw`` (m,) rad."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    x, y = vectors[:, 0], vectors[:, 1]
+    return np.stack([c * x - s * y, s * x + c * y, vectors[:, 2]], axis=1)
+
+
+def rigid_move(shift_m: FloatArray, rotation_vector: FloatArray, centre: FloatArray) -> FloatArray:
+    """Transform (4, 4) that turns by ``rotation_vector`` (rad) about ``centre`` and then shifts, m."""
+    T = np.eye(4)
+    T[:3, :3] = rotation_matrix(rotation_vector)
+    T[:3, 3] = centre - T[:3, :3] @ centre + shift_m
+    return T
