@@ -111,7 +111,7 @@ class OutlierParams(StageParams):
 
     is_enabled: bool = param(True, "remove statistical outliers")
     k: int = param(20, "neighbours whose mean distance is judged", symbol="k", low=1, high=200)
-    std_multiplier: float = param(1.0, "standard deviations above the mean that make an outlier", low=0.1, high=20)
+    std_multiplier: float = param(3.0, "standard deviations above the mean that make an outlier", low=0.1, high=20)
 
 
 @dataclass(frozen=True)
@@ -216,6 +216,9 @@ class LodParams(StageParams):
         "measured",
         "what the surveys disagree by beyond noise and pose, on surfaces that mostly did not change, or nothing",
         choices=("measured", "none"),
+    )
+    max_drift_m: float = param(
+        0.10, "largest drift, one sigma, that is believed; more is change", unit="m", low=0, high=5
     )
     variation: str = param("spatial", "limit per cell, or one number for the map", choices=("spatial", "global"))
 
@@ -660,7 +663,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
         "normals": {"radius_m": 1.5},
         "icp": {"leaves_m": (2.0, 1.0, 0.5), "radii_m": (3.0, 1.5, 0.75)},
         "ground": {"max_object_m": 60.0, "min_voxels": 4},
-        "lod": {"radius_m": 2.0, "min_points": 12},
+        "lod": {"radius_m": 2.0, "min_points": 12, "max_drift_m": 0.25},
         "features": {"radius_m": 1.25},
         "superpoints": {"max_edge_m": 2.0},
         "proxies": {"voxel_m": 1.0, "min_voxels": 50},
@@ -681,6 +684,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
     },
     "paper": {
         "name": "paper",
+        "outliers": {"std_multiplier": 1.0},
         "icp": {"covariance": "normal"},
         "ground": {"vertical": "ground"},
         "lod": {"pose_term": "translation", "small_sample": False, "drift_term": "none"},

@@ -33,6 +33,8 @@ MAX_EXTENT_M = 100_000.0
 MIN_DENSITY = 0.01
 _SMALL_AREA_M2 = 10_000.0
 _SMALLEST_HEADER = 227
+_POINTS_AT_ONCE = 500_000
+"""Decompressing holds the interpreter lock: in pieces, so that a run can be stopped in between."""
 
 _UNREADABLE = (LaspyException, LazrsError, ValueError, EOFError, struct.error, OverflowError, MemoryError, IndexError)
 
@@ -358,14 +360,18 @@ def _read_points(info: SurveyInfo) -> Any:
     path = Path(info.path)
     try:
         with laspy.open(path) as reader:
-            data = reader.read()
+            points = laspy.ScaleAwarePointRecord.zeros(info.n_points, header=reader.header)
+            n_read = 0
+            for part in reader.chunk_iterator(_POINTS_AT_ONCE):
+                points.array[n_read : n_read + len(part)] = part.array
+                n_read += len(part)
     except OSError as error:
         raise _unreadable(path, error) from error
     except _UNREADABLE as error:
         raise _broken(path, str(error)) from error
-    if len(data.points) != info.n_points:
-        raise _broken(path, f"the header promises {info.n_points} points, {len(data.points)} could be read")
-    return data
+    if n_read != info.n_points:
+        raise _broken(path, f"the header promises {info.n_points} points, {n_read} could be read")
+    return laspy.LasData(reader.header, points)
 
 
 def _map_coordinates(source: Any, info: SurveyInfo) -> FloatArray:

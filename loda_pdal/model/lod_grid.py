@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -34,6 +34,8 @@ class LodGrid:
         Difference of the two epochs' mean offsets along ``normal``, after minus before; NaN where not valid.
     low_observability_m : float
         The value where nothing is valid, m.
+    drift : (3, 3) float64, m2
+        Covariance of what the epochs disagree by beyond noise and pose: trajectories drift.
     """
 
     cells: IntArray
@@ -45,6 +47,7 @@ class LodGrid:
     is_valid: BoolArray
     displacement: Float32Array
     low_observability_m: float
+    drift: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
 
     @property
     def centres(self) -> FloatArray:

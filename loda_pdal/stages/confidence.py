@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+from scipy.special import erf
+
+from loda_pdal.model.cloud import FloatArray
 from loda_pdal.model.labels import ChangeLabel
 from loda_pdal.params import ConfidenceParams
+from loda_pdal.stages.ground_changes import GroundChanges
 
 
 def raw_confidence(
@@ -61,6 +66,22 @@ def calibrated(raw: float, label: ChangeLabel, params: ConfidenceParams) -> floa
     else:
         offset, slope = params.calibration_changed
     return 1.0 / (1.0 + math.exp(-(offset + slope * raw)))
+
+
+def ground_confidence(ground: GroundChanges, min_dz_m: float) -> FloatArray:
+    """Probability (t,) that the label of each ground tile is right; NaN where it is undetermined.
+
+    The measured elevation change is taken as normal about the true one, with LoD95 / 1.96 as its standard deviation:
+    a changed tile is right if the ground really moved in that direction, an unchanged one if it moved less than the
+    least change that counts.
+    """
+    deviation = np.maximum(ground.lod95 / 1.96, 1e-6) * math.sqrt(2.0)
+    moved = 0.5 * (1.0 + erf(np.abs(ground.dz) / deviation))
+    margin = (min_dz_m - np.abs(ground.dz)) / deviation
+    still = 0.5 * (1.0 + erf(margin))
+    is_changed = np.isin(ground.label, (ChangeLabel.INCREASED, ChangeLabel.DECREASED))
+    sure = np.where(is_changed, moved, still)
+    return np.where(ground.label == ChangeLabel.UNDETERMINED, np.nan, sure)
 
 
 def _saturated(multiple: float) -> float:

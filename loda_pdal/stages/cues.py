@@ -70,8 +70,10 @@ class Cells:
         Whether that epoch has a surface within the query radius of the centre.
     is_seen : Pair of (c,) bool
         Whether that epoch saw the voxel's column, and would have hit what the other epoch shows there.
+    normal : (c, 3) float64
+        Mean unit normal of both epochs' nearest surfaces, of either sign; zero where either surface is missing.
     displacement : (c,) float64, m
-        Along the mean normal, after minus before (equation 5); NaN where either surface is missing.
+        Along ``normal``, after minus before (equation 5); NaN where either surface is missing.
     lod95 : (c,) float64, m
         Detection limit at the centre.
     """
@@ -81,6 +83,7 @@ class Cells:
     n_raw: Pair[FloatArray]
     is_near: Pair[BoolArray]
     is_seen: Pair[BoolArray]
+    normal: FloatArray
     displacement: FloatArray
     lod95: FloatArray
 
@@ -164,7 +167,9 @@ def sample_cells(surfaces: Pair[Surface], coverage: Pair[Coverage] | None, lod: 
     rows = np.concatenate([occupied.before.cell, occupied.after.cell])
     if len(rows) == 0:
         nothing, never, no = np.zeros(0, np.int32), np.zeros(0, np.bool_), np.zeros(0)
-        return Cells(rows, Pair(nothing, nothing), Pair(no, no), Pair(never, never), Pair(never, never), no, no)
+        return Cells(
+            rows, Pair(nothing, nothing), Pair(no, no), Pair(never, never), Pair(never, never), np.zeros((0, 3)), no, no
+        )
     lattice = Lattice.around(rows)
     keys, first = np.unique(lattice.keys(rows), return_index=True)
     cell = rows[first]
@@ -179,7 +184,8 @@ def sample_cells(surfaces: Pair[Surface], coverage: Pair[Coverage] | None, lod: 
         expected = _expected_points(owner, n_raw)
         is_hit = expected.map(lambda points: points >= params.min_expected_points)
         is_seen = is_seen.join(is_hit, lambda seen, hit: seen & hit)
-    return Cells(cell, owner, n_raw, is_near, is_seen, _displacement(surfaces, found), lod.at(centre))
+    normal, displacement = _displacement(surfaces, found)
+    return Cells(cell, owner, n_raw, is_near, is_seen, normal, displacement, lod.at(centre))
 
 
 def _expected_points(owner: Pair[IntArray], n_raw: Pair[FloatArray]) -> Pair[FloatArray]:
@@ -229,6 +235,7 @@ def weigh(
 
     samples = Groups(np.where(np.isfinite(cells.displacement[voxel]), owner, -1), n)
     is_sampled = samples.counts >= params.min_samples
+    displacement = cells.displacement[voxel] * _facing(cells.normal[voxel], samples)
     points = surfaces.map(lambda surface: Groups(surface.owner, n))
     lowest = points.join(surfaces, lambda group, surface: group.minimum(surface.xyz[:, 2]))
     highest = points.join(surfaces, lambda group, surface: group.maximum(surface.xyz[:, 2]))
@@ -250,8 +257,8 @@ def weigh(
         dh=top.after - top.before,
         dv=dv,
         dv_ratio=np.divide(dv, base, out=np.full(n, np.nan), where=base > 0),
-        d_perp=np.where(is_sampled, samples.median(cells.displacement[voxel]), np.nan),
-        d_typical=np.where(is_sampled, samples.median(np.abs(cells.displacement[voxel])), np.nan),
+        d_perp=np.where(is_sampled, samples.median(displacement), np.nan),
+        d_typical=np.where(is_sampled, samples.median(np.abs(displacement)), np.nan),
         gained_above=_count(own.after, cells.is_gained & _is_above(middle[:, 2], own.after, summit.before), n),
         lost_above=_count(own.before, cells.is_lost & _is_above(middle[:, 2], own.before, summit.after), n),
         lod95=Groups(owner, n).median(cells.lod95[voxel]),
@@ -312,18 +319,30 @@ def _nearest_surface(surface: Surface, centre: FloatArray, reach_m: float) -> In
     return np.where(found >= 0, members[np.maximum(found, 0)], -1).astype(np.int32)
 
 
-def _displacement(surfaces: Pair[Surface], found: Pair[IntArray]) -> FloatArray:
-    """Offset between the nearest surface points along their mean normal (equation 5); NaN where one is missing."""
-    displacement = np.full(len(found.before), np.nan)
+def _displacement(surfaces: Pair[Surface], found: Pair[IntArray]) -> tuple[FloatArray, FloatArray]:
+    """Mean normal (c, 3) of the nearest surface points and their offset (c,) m along it (equation 5)."""
+    normal, displacement = np.zeros((len(found.before), 3)), np.full(len(found.before), np.nan)
     is_both = (found.before >= 0) & (found.after >= 0)
     b, a = found.before[is_both], found.after[is_both]
     n_b, n_a = surfaces.before.normals[b].astype(np.float64), surfaces.after.normals[a].astype(np.float64)
     n_a = np.where(np.sum(n_b * n_a, axis=1, keepdims=True) < 0, -n_a, n_a)
     mean = n_b + n_a
-    length = np.linalg.norm(mean, axis=1)
+    length = np.linalg.norm(mean, axis=1, keepdims=True)
+    mean = np.divide(mean, length, out=np.zeros_like(mean), where=length > 0.5)
     offset = np.sum(mean * (surfaces.after.xyz[a] - surfaces.before.xyz[b]), axis=1)
-    displacement[is_both] = np.divide(offset, length, out=np.full(len(b), np.nan), where=length > 0.5)
-    return displacement
+    normal[is_both] = mean
+    displacement[is_both] = np.where(length[:, 0] > 0.5, offset, np.nan)
+    return normal, displacement
+
+
+def _facing(normal: FloatArray, samples: Groups) -> FloatArray:
+    """Sign (k,) that turns each normal to the side its object mostly faces; a fitted normal has no sign of its own."""
+    scatter = samples.sum(np.einsum("ij,ik->ijk", normal, normal).reshape(-1, 9)).reshape(-1, 3, 3)
+    axis = np.linalg.eigh(scatter)[1][:, :, 2] if len(scatter) else np.zeros((0, 3))
+    leading = np.take_along_axis(axis, np.argmax(np.abs(axis), axis=1)[:, None], axis=1)
+    axis = np.where(leading < 0, -axis, axis)
+    along = np.sum(normal * np.append(axis, np.zeros((1, 3)), axis=0)[samples.labels], axis=1)
+    return np.where(along < 0, -1.0, 1.0)
 
 
 def _tops(surfaces: Pair[Surface], coverage: Pair[Coverage] | None, n: int, cell_m: float) -> Pair[FloatArray]:

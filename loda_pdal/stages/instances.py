@@ -306,7 +306,7 @@ def _vegetation(
 def split_crowns(xyz: FloatArray, height: FloatArray, cluster: IntArray, cell_m: float = 0.5) -> IntArray:
     """Clusters (m,) split where crowns touch: each point goes to the height maximum uphill of it in plan.
 
-    The canopy height is taken on a ``cell_m`` raster and smoothed over 1 m; each cell climbs from neighbour to neighbour
+    The canopy height is taken on a ``cell_m`` raster and smoothed over 1 m; each cell climbs from cell to cell
     to its maximum, and a maximum with a higher place within 1.5 m climbs on, so that close maxima are one crown.
     """
     low = np.floor(xyz[:, :2].min(axis=0) / cell_m)

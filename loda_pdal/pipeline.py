@@ -1,0 +1,404 @@
+"""The method, read top to bottom: `detect_changes` calls one step per stage of the paper, in order.
+
+Each step below takes both epochs and what earlier steps found, and returns what it found: the PDAL face calls the same
+steps one at a time. Swapping the epochs swaps the answer exactly, because every step treats the two alike and the
+analysis frame is chosen by what the clouds hold (see `Registration.reference`).
+"""
+
+from __future__ import annotations
+
+import math
+import resource
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from loda_pdal.assembly import ground_records, instance_records, object_records, outline_of, point_labels
+from loda_pdal.model.cloud import BoolArray, FloatArray, IntArray, VoxelCloud
+from loda_pdal.model.labels import ChangeLabel, ObjectClass
+from loda_pdal.model.lod_grid import LodGrid
+from loda_pdal.model.pair import Pair
+from loda_pdal.model.records import (
+    ChangeResult,
+    InstanceRecord,
+    PointLabels,
+    StageCost,
+)
+from loda_pdal.model.registration import Registration
+from loda_pdal.model.survey import Survey
+from loda_pdal.model.transform import rotation_between, transform_points
+from loda_pdal.params import Parameters
+from loda_pdal.stages.association import Descriptors, Matches, associate, describe
+from loda_pdal.stages.changes import Changes, decide_changes
+from loda_pdal.stages.correspondence import Objects, match_instances, owners
+from loda_pdal.stages.cues import Surface
+from loda_pdal.stages.features import Features, eigen_features
+from loda_pdal.stages.fuse import fuse_points
+from loda_pdal.stages.ground import GroundModel, ground_model
+from loda_pdal.stages.ground_changes import GroundChanges, ground_changes
+from loda_pdal.stages.instances import Instances, form_instances
+from loda_pdal.stages.lod import level_of_detection
+from loda_pdal.stages.observability import coverage
+from loda_pdal.stages.outliers import remove_outliers
+from loda_pdal.stages.proxies import Proxies, build_proxies
+from loda_pdal.stages.registration import register
+from loda_pdal.stages.semantics import Semantics, classify
+from loda_pdal.stages.superpoints import Superpoints, superpoints
+
+Progress = Callable[[int, int, str], None]
+
+STEPS = {
+    "fuse": "fusing points",
+    "register": "registering the epochs",
+    "ground": "modelling the ground",
+    "lod": "estimating the limit of detection",
+    "proxies": "matching proxies",
+    "superpoints": "partitioning into superpoints",
+    "semantics": "classifying",
+    "instances": "forming instances",
+    "objects": "matching objects",
+    "changes": "deciding changes",
+    "ground_changes": "comparing the ground",
+    "result": "outlining objects",
+}
+"""The steps in order, with the words that progress shows."""
+
+
+def detect_changes(
+    before: Survey, after: Survey, parameters: Parameters | None = None, progress: Progress | None = None
+) -> ChangeResult:
+    """Objects that were added, removed, grew or shrank between two surveys (paper, section 4).
+
+    Parameters
+    ----------
+    before, after : Survey
+        Both epochs in one local frame, see `read_epochs`.
+    parameters : Parameters, optional
+        Choices of the method; the ``street`` preset if left out.
+    progress : callable, optional
+        ``progress(done, total, text)``, called before each step and at the end.
+
+    Returns
+    -------
+    ChangeResult
+        Objects, changed ground, and values for every raw point, in local metres of the after frame.
+    """
+    points = Pair(before.xyz, after.xyz)
+    p = resolve(parameters or Parameters(), points)
+    clock = StepClock(progress)
+    with clock("fuse"):
+        fused = fuse_epochs(points, p)
+    with clock("register"):
+        registration = register_epochs(fused, p)
+        clouds = into_frame(fused, registration)
+    with clock("ground"):
+        ground = model_ground(clouds, p)
+    with clock("lod"):
+        lod = limit_of_detection(clouds, registration, p)
+    with clock("proxies"):
+        proxies = match_proxies(clouds, ground, p)
+    with clock("superpoints"):
+        segments = form_superpoints(clouds, ground, p)
+    with clock("semantics"):
+        classes = classify_superpoints(clouds, segments, p)
+    with clock("instances"):
+        instances = segment_instances(clouds, ground, segments, classes, p)
+    with clock("objects"):
+        objects = match_objects(clouds, ground, instances, proxies, p)
+    with clock("changes"):
+        changes = label_objects(clouds, ground, segments, instances, objects, lod, p)
+    with clock("ground_changes"):
+        ground_change = compare_ground(clouds, instances, lod, p)
+    with clock("result"):
+        result = assemble(points, clouds, registration, ground, lod, segments, instances, changes, ground_change, p)
+    return replace(result, costs=clock.costs)
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Ground model of one epoch and the height of its fused points above it, (m,) float64 m; NaN where unknown."""
+
+    model: GroundModel
+    height: FloatArray
+
+
+@dataclass(frozen=True)
+class ProxyMatches:
+    """Proxies of both epochs and which of them belong together; None where the preset has no proxies."""
+
+    proxies: Pair[Proxies]
+    matches: Matches
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Features and superpoints of one epoch's fused points."""
+
+    features: Features
+    superpoints: Superpoints
+
+
+def resolve(parameters: Parameters, points: Pair[FloatArray]) -> Parameters:
+    """Parameters for these points (n, 3) m: neighbourhoods grow with the sparser survey's spacing where allowed."""
+    return parameters.for_spacing(max(mean_spacing(points.before), mean_spacing(points.after)))
+
+
+def mean_spacing(xyz: FloatArray) -> float:
+    """Mean point spacing (m) in plan: root of the area of occupied 2 m cells, with their gaps, per point."""
+    if len(xyz) == 0:
+        return 0.0
+    cells = np.unique(np.floor(xyz[:, :2] / _SPACING_CELL_M).astype(np.int64), axis=0)
+    return float(_SPACING_CELL_M * np.sqrt(len(cells) / len(xyz)))
+
+
+_SPACING_CELL_M = 5.0
+
+
+def fuse_epochs(points: Pair[FloatArray], p: Parameters) -> Pair[VoxelCloud]:
+    """One point per voxel, without statistical outliers (section 4.1)."""
+    return points.map(lambda xyz: remove_outliers(fuse_points(xyz, p.fuse), p.outliers))
+
+
+def register_epochs(fused: Pair[VoxelCloud], p: Parameters) -> Registration:
+    """Move between the epochs, its covariance, and the common vertical axis (section 4.1, equation 1)."""
+    registration = register(fused, p)
+    if p.ground.vertical == "plumb":
+        return registration
+    clouds = into_frame(fused, registration)
+    ups = clouds.map(lambda cloud: ground_model(cloud.xyz, cloud.n_raw, p.ground).up)
+    up = ups.before + ups.after
+    return registration.with_vertical(rotation_between(up / np.linalg.norm(up), np.array([0.0, 0.0, 1.0])))
+
+
+def into_frame(fused: Pair[VoxelCloud], registration: Registration) -> Pair[VoxelCloud]:
+    """Both epochs in the analysis frame."""
+    moves = Pair(registration.T_frame_before, registration.T_frame_after)
+    return fused.join(moves, lambda cloud, T: cloud.moved(transform_points(T, cloud.xyz)))
+
+
+def model_ground(clouds: Pair[VoxelCloud], p: Parameters) -> Pair[Ground]:
+    """Ground model of each epoch and heights above it (section 4.1)."""
+
+    def of_epoch(cloud: VoxelCloud) -> Ground:
+        model = ground_model(cloud.xyz, cloud.n_raw, p.ground)
+        return Ground(model, cloud.xyz[:, 2] - model.height_at(cloud.xyz[:, :2]))
+
+    return clouds.map(of_epoch)
+
+
+def limit_of_detection(clouds: Pair[VoxelCloud], registration: Registration, p: Parameters) -> LodGrid:
+    """LoD95 on a sparse grid (equation 2)."""
+    return level_of_detection(clouds.before.xyz, clouds.after.xyz, registration.covariance, registration.centre, p.lod)
+
+
+def match_proxies(clouds: Pair[VoxelCloud], ground: Pair[Ground], p: Parameters) -> ProxyMatches | None:
+    """Geometry-only proxies and their assignment (section 4.1)."""
+    if not p.proxies.is_enabled:
+        return None
+    proxies = clouds.join(
+        ground,
+        lambda cloud, g: build_proxies(cloud.xyz, g.height, _is_on_ground(g, p), p.proxies, p.association.boxes),
+    )
+    return ProxyMatches(proxies, associate(proxies.before.descriptors, proxies.after.descriptors, p.association))
+
+
+def form_superpoints(clouds: Pair[VoxelCloud], ground: Pair[Ground], p: Parameters) -> Pair[Segments]:
+    """Geometric features and superpoints (section 4.2, equations 3 and 4)."""
+
+    def of_epoch(cloud: VoxelCloud, g: Ground) -> Segments:
+        features = eigen_features(cloud.xyz, g.height, p.features)
+        return Segments(features, superpoints(cloud.xyz, features, p.superpoints))
+
+    return clouds.join(ground, of_epoch)
+
+
+def classify_superpoints(clouds: Pair[VoxelCloud], segments: Pair[Segments], p: Parameters) -> Pair[Semantics]:
+    """Class of every superpoint (section 4.2)."""
+    return clouds.join(
+        segments,
+        lambda cloud, s: classify(
+            cloud.xyz, p.fuse.leaf_m, s.features, s.superpoints.labels, s.superpoints.n, p.semantics
+        ),
+    )
+
+
+def segment_instances(
+    clouds: Pair[VoxelCloud], ground: Pair[Ground], segments: Pair[Segments], classes: Pair[Semantics], p: Parameters
+) -> Pair[Instances]:
+    """Instances within each class (section 4.2)."""
+
+    def of_epoch(cloud: VoxelCloud, g: Ground, s: Segments, semantics: Semantics) -> Instances:
+        return form_instances(cloud.xyz, cloud.n_raw, g.height, semantics, p.instances, p.semantics)
+
+    return Pair(
+        of_epoch(clouds.before, ground.before, segments.before, classes.before),
+        of_epoch(clouds.after, ground.after, segments.after, classes.after),
+    )
+
+
+def match_objects(
+    clouds: Pair[VoxelCloud],
+    ground: Pair[Ground],
+    instances: Pair[Instances],
+    proxies: ProxyMatches | None,
+    p: Parameters,
+) -> Objects:
+    """Class-consistent association of the instances (sections 4.1 and 4.2)."""
+    heights = clouds.join(ground, lambda cloud, g: np.where(np.isfinite(g.height), g.height, 0.0))
+    descriptors = Pair(
+        _descriptors(clouds.before, heights.before, instances.before, p),
+        _descriptors(clouds.after, heights.after, instances.after, p),
+    )
+    proxy_pairs = None if proxies is None else (proxies.proxies.map(lambda side: side.proxy), proxies.matches)
+    xyz = clouds.map(lambda cloud: cloud.xyz)
+    return match_instances(xyz, instances, descriptors, proxy_pairs, p.changes.query_radius_m, p.association)
+
+
+def label_objects(
+    clouds: Pair[VoxelCloud],
+    ground: Pair[Ground],
+    segments: Pair[Segments],
+    instances: Pair[Instances],
+    objects: Objects,
+    lod: LodGrid,
+    p: Parameters,
+) -> Changes:
+    """Cues and change labels (section 4.3)."""
+    owner = instances.join(objects.of_instance, owners)
+
+    def surface(cloud: VoxelCloud, g: Ground, s: Segments, i: Instances, own: IntArray) -> Surface:
+        is_surface = i.classification != ObjectClass.GROUND
+        return Surface(cloud.xyz, s.features.normals, g.height, cloud.n_raw, own, is_surface)
+
+    surfaces = Pair(*(surface(*each) for each in zip(clouds, ground, segments, instances, owner, strict=True)))
+    covered = clouds.map(lambda cloud: coverage(cloud.xyz, p.observability))
+    return decide_changes(surfaces, objects.object_class, covered, lod, p.changes, p.observability, p.confidence)
+
+
+def compare_ground(clouds: Pair[VoxelCloud], instances: Pair[Instances], lod: LodGrid, p: Parameters) -> GroundChanges:
+    """Changed ground on a 2 m raster (section 4.3)."""
+    is_ground = instances.map(lambda side: side.classification == ObjectClass.GROUND)
+    return ground_changes(clouds.map(lambda cloud: cloud.xyz), is_ground, lod, p.ground_changes)
+
+
+def assemble(
+    points: Pair[FloatArray],
+    clouds: Pair[VoxelCloud],
+    registration: Registration,
+    ground: Pair[Ground],
+    lod: LodGrid,
+    segments: Pair[Segments],
+    instances: Pair[Instances],
+    changes: Changes,
+    ground_change: GroundChanges,
+    p: Parameters,
+) -> ChangeResult:
+    """Everything found, on raw points and as records with outlines, in the after frame."""
+    in_after = clouds.map(lambda cloud: transform_points(registration.T_after_frame, cloud.xyz))
+
+    def labels_of(
+        xyz: FloatArray, T: FloatArray, cloud: VoxelCloud, g: Ground, s: Segments, i: Instances, o: IntArray
+    ) -> PointLabels:
+        return point_labels(
+            xyz, T, cloud, g.model, lod, s.superpoints.labels, i, o, changes, ground_change, p.ground_changes.min_dz_m
+        )
+
+    def instances_of(cloud: VoxelCloud, xyz: FloatArray, g: Ground, i: Instances, o: IntArray) -> list[InstanceRecord]:
+        return instance_records(cloud, xyz, g.height, i, o, _outline_m(p), p.changes.voxel_m)
+
+    moves = Pair(registration.T_frame_before, registration.T_frame_after)
+    has_ground = ground.before.model.has_ground and ground.after.model.has_ground
+    return ChangeResult(
+        objects=object_records(in_after, instances, changes, _outline_m(p)),
+        ground_changes=ground_records(ground_change, registration.T_after_frame),
+        instances=Pair(
+            *(instances_of(*each) for each in zip(clouds, in_after, ground, instances, changes.owner, strict=True))
+        ),
+        points=Pair(
+            *(
+                labels_of(*each)
+                for each in zip(points, moves, clouds, ground, segments, instances, changes.owner, strict=True)
+            )
+        ),
+        registration=registration,
+        lod=lod,
+        clouds=in_after,
+        object_of_voxel=changes.owner.map(lambda side: (side + 1).astype(np.uint32)),
+        block=outline_of(in_after),
+        parameters=p,
+        has_ground=has_ground,
+        warnings=warnings_of(registration, has_ground, changes),
+    )
+
+
+def warnings_of(registration: Registration, has_ground: bool, changes: Changes) -> list[str]:
+    """What a user must know before trusting the result."""
+    found = []
+    if not registration.converged:
+        found.append(f"Registration did not converge: {registration.message} Check the overlap before using any label.")
+    dx, dy, dz = registration.shift_m
+    if abs(dz) > _DATUM_SHIFT_M:
+        found.append(
+            f"The before survey was moved by {dz:+.2f} m in height to fit the after survey: check the vertical datums; "
+            "a real uplift or subsidence of the whole area would look the same."
+        )
+    if math.hypot(dx, dy) > _PLAN_SHIFT_M:
+        found.append(f"The before survey was moved by {math.hypot(dx, dy):.2f} m in plan to fit the after survey.")
+    if not has_ground:
+        found.append(
+            "No ground was found: heights are above the lowest returns nearby, and ground changes were not evaluated."
+        )
+    unseen = np.count_nonzero(changes.label == ChangeLabel.UNDETERMINED)
+    if len(changes) and unseen > 0.2 * len(changes):
+        found.append(
+            f"{unseen} of {len(changes)} objects are Undetermined: the other survey could not have seen enough of them."
+        )
+    return found
+
+
+_DATUM_SHIFT_M = 0.10
+_PLAN_SHIFT_M = 0.50
+
+
+def _outline_m(p: Parameters) -> float:
+    """Resolution of outlines: the occupancy voxel."""
+    return p.changes.voxel_m
+
+
+def _descriptors(cloud: VoxelCloud, height: FloatArray, instances: Instances, p: Parameters) -> Descriptors:
+    """What the association compares of one epoch's instances."""
+    return describe(
+        cloud.xyz,
+        height,
+        instances.instance,
+        len(instances),
+        p.proxies.histogram_bins,
+        p.proxies.voxel_m,
+        p.association.boxes,
+    )
+
+
+def _is_on_ground(ground: Ground, p: Parameters) -> BoolArray:
+    return np.asarray(np.abs(ground.height) < p.semantics.ground_distance_m)
+
+
+class StepClock:
+    """Says when steps begin and remembers what they took."""
+
+    def __init__(self, progress: Progress | None) -> None:
+        self.costs: list[StageCost] = []
+        self._progress = progress or (lambda done, total, text: None)
+
+    @contextmanager
+    def __call__(self, step: str) -> Iterator[None]:
+        """Announce a step, run it, note its seconds and the peak memory of the process so far."""
+        self._progress(len(self.costs), len(STEPS), STEPS[step])
+        start = time.perf_counter()
+        yield
+        peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        self.costs.append(StageCost(step, time.perf_counter() - start, peak_mb))
+        if len(self.costs) == len(STEPS):
+            self._progress(len(STEPS), len(STEPS), "done")
