@@ -1,0 +1,165 @@
+"""``loda-pdal detect``: two surveys in, a folder with the changes out."""
+
+from __future__ import annotations
+
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from loda_pdal.cli import options, stopping, verbosity
+from loda_pdal.cli.progress import Reporter, reporter_for
+
+if TYPE_CHECKING:
+    from loda_pdal.model.pair import Pair
+    from loda_pdal.model.survey import Survey
+    from loda_pdal.params import Parameters
+
+
+@click.command(short_help="Find what changed between two surveys.")
+@click.argument("before", type=click.Path(path_type=Path))
+@click.argument("after", type=click.Path(path_type=Path))
+@click.option(
+    "-o", "--output", "folder", required=True, type=click.Path(path_type=Path), help="Folder for the results."
+)
+@options.parameters
+@options.epsg
+@options.assume_same_crs
+@options.threads
+@click.option(
+    "--max-memory", type=click.FloatRange(min=0, min_open=True), metavar="GB", help="Memory the run may take."
+)
+@click.option("--keep-frames", is_flag=True, help="Do not move the before points onto the after survey.")
+@options.overwrite
+@options.as_json
+@options.progress
+@click.option("--validate", is_flag=True, help="Check everything, compute nothing.")
+@verbosity.options
+def detect(
+    before: Path,
+    after: Path,
+    folder: Path,
+    preset: str | None,
+    params_file: Path | None,
+    settings: tuple[str, ...],
+    epsg: int | None,
+    assume_same_crs: bool,
+    threads: int | None,
+    max_memory: float | None,
+    keep_frames: bool,
+    overwrite: bool,
+    as_json: bool,
+    progress_kind: str,
+    validate: bool,
+) -> None:
+    """Find what changed between the surveys BEFORE and AFTER (LAS, LAZ or COPC)."""
+    with reporter_for(progress_kind) as reporter:
+        if progress_kind == "json":
+            stopping.when_parent_dies()
+        parameters = options.chosen_parameters(preset, params_file, settings)
+        from loda_pdal.io.outputs import check_output_folder
+
+        check_output_folder(folder, overwrite, (before, after))
+        surveys = _read(reporter, before, after, parameters, epsg, assume_same_crs, max_memory)
+        if validate:
+            reporter.info("Everything is in order; nothing was computed.")
+            return
+        summary, outputs = _run(reporter, surveys, folder, parameters, threads, keep_frames, overwrite)
+        reporter.result(outputs, summary)
+    if progress_kind == "json":
+        return
+    if as_json:
+        from loda_pdal.io.plain import to_json
+
+        click.echo(to_json({"outputs": outputs, "summary": summary}), nl=False)
+    else:
+        click.echo(_readable(summary, outputs))
+
+
+def _read(
+    reporter: Reporter,
+    before: Path,
+    after: Path,
+    parameters: Parameters,
+    epsg: int | None,
+    assume_same_crs: bool,
+    max_memory: float | None,
+) -> Pair[Survey]:
+    """Both surveys, after every check that can be made before long work."""
+    from loda_pdal.io.las import read_epochs
+
+    reporter.progress(0, 1, "reading the surveys")
+    surveys = read_epochs(
+        before,
+        after,
+        epsg=epsg,
+        assume_same_crs=assume_same_crs,
+        max_memory=None if max_memory is None else int(max_memory * 1e9),
+        leaf_m=parameters.fuse.leaf_m,
+    )
+    for epoch in surveys:
+        for note in epoch.notes:
+            reporter.info(f"{epoch.path}: {note}")
+    return surveys
+
+
+def _run(
+    reporter: Reporter,
+    surveys: Pair[Survey],
+    folder: Path,
+    parameters: Parameters,
+    threads: int | None,
+    keep_frames: bool,
+    overwrite: bool,
+) -> tuple[dict[str, Any], dict[str, Path]]:
+    """The run itself: its summary and the files it wrote."""
+    from loda_pdal.io.outputs import abandon_outputs, write_outputs
+    from loda_pdal.io.summary import summarise
+    from loda_pdal.kernels import is_cache_warm
+    from loda_pdal.kernels.parallel import set_threads
+    from loda_pdal.pipeline import STEPS, detect_changes
+
+    stopping.before_stopping(abandon_outputs)
+    set_threads(threads)
+    if not is_cache_warm():
+        reporter.info("The first run compiles its kernels, once; that takes about a minute.")
+    started, total = datetime.now(tz=UTC), len(STEPS) + 1
+
+    def progress(done: int, of: int, text: str) -> None:
+        if done < of:
+            reporter.progress(done, total, text)
+
+    result = detect_changes(surveys.before, surveys.after, parameters, progress)
+    summary = summarise(result, surveys)
+    for warning in summary["warnings"]:
+        reporter.warning(warning)
+    reporter.progress(len(STEPS), total, "writing the results")
+    run_info = {
+        "command": ["loda-pdal", *sys.argv[1:]],
+        "started": started.isoformat(timespec="seconds"),
+        "preset": parameters.name,
+    }
+    outputs = write_outputs(result, surveys, folder, overwrite=overwrite, keep_frames=keep_frames, run_info=run_info)
+    reporter.progress(total, total, "done")
+    return summary, outputs
+
+
+def _readable(summary: dict[str, Any], outputs: dict[str, Path]) -> str:
+    """The summary in a few lines."""
+    lines = [f"{summary['changed']} of {summary['objects']} objects changed."]
+    for label, kinds in summary["counts"].items():
+        n = sum(kinds.values())
+        if n:
+            parts = ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count)
+            lines.append(f"  {label:<13}{n:>6}   {parts}")
+    for label, figures in summary["ground_changes"].items():
+        if figures["pieces"]:
+            word = "raised" if label == "Increased" else "lowered"
+            lines.append(f"  Ground {word}: {figures['pieces']} places, {figures['area_m2']:.0f} m2")
+    lod = summary["lod95"]
+    if lod["median_m"] is not None:
+        lines.append(f"Limit of detection (95 %): {lod['median_m']:.3f} m in the median.")
+    width = max(map(len, outputs))
+    return "\n".join(lines + [f"  {name:<{width}}  {path}" for name, path in outputs.items()])

@@ -1,0 +1,74 @@
+"""Options that several commands share, and what they mean together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from loda_pdal.cli.progress import KINDS
+from loda_pdal.params import PRESETS, Parameters
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def parameters(command: F) -> F:
+    """``--preset``, ``--params`` and ``--set``, handed on as ``preset``, ``params_file`` and ``settings``."""
+    for option in (
+        click.option(
+            "--set",
+            "settings",
+            metavar="STAGE.KEY=VALUE",
+            multiple=True,
+            help="Set one parameter; may be given more than once, wins over --params.",
+        ),
+        click.option(
+            "--params",
+            "params_file",
+            metavar="FILE",
+            type=click.Path(path_type=Path),
+            help="TOML or JSON with parameters, over the preset.",
+        ),
+        click.option(
+            "--preset",
+            type=click.Choice(PRESETS),
+            help="Where to start from: vehicle LiDAR (street, the default), airborne, or the paper to the letter.",
+        ),
+    ):
+        command = option(command)
+    return command
+
+
+def chosen_parameters(preset: str | None, params_file: Path | None, settings: Sequence[str]) -> Parameters:
+    """Parameters as the three options choose them; `ParameterError` for what is unknown or out of range."""
+    base = Parameters.preset(preset) if preset else None
+    chosen = Parameters.load(params_file, base) if params_file else base or Parameters()
+    for setting in settings:
+        chosen = chosen.with_setting(setting)
+    return chosen
+
+
+as_json = click.option("--json", "as_json", is_flag=True, help="Write the result as JSON to stdout.")
+
+overwrite = click.option("--overwrite", is_flag=True, help="Replace what is there.")
+
+threads = click.option(
+    "--threads", type=click.IntRange(min=1), metavar="N", help="Threads to use; all processors if left out."
+)
+
+epsg = click.option("--epsg", type=click.IntRange(min=1), metavar="N", help="CRS of both surveys, whatever they say.")
+
+assume_same_crs = click.option(
+    "--assume-same-crs", is_flag=True, help="Go on although the surveys name different CRS, or none."
+)
+
+progress = click.option(
+    "--progress",
+    "progress_kind",
+    type=click.Choice(KINDS),
+    default="auto",
+    show_default=True,
+    help="A bar on stderr (plain lines where that is no terminal), or one JSON object a line on stdout.",
+)
