@@ -1,0 +1,103 @@
+"""Both epochs around each cell of the LoD grid: common plane direction, noise and offset of each epoch."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from loda_pdal.kernels.geometry import eigen_symmetric_3x3
+from loda_pdal.kernels.neighbours import empty_runs, runs_within, sq_distance
+from loda_pdal.kernels.planes import LINE
+
+MAD_TO_STD = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
+
+TRIM = 3.0
+"""Points farther than this many standard deviations from the median leave the mean offset."""
+
+
+@njit(nogil=True, cache=True)
+def pool_range(  # type: ignore[no-untyped-def]
+    start, stop, before, after, centres, radius, min_points, max_isotropy, n_points, normal, sigma, offset, is_valid
+):
+    """Fill (c, 2) counts, (c, 3) normals, (c, 2) noise and offsets (m), (c,) validity for cells [start, stop).
+
+    ``before`` and ``after`` are cell lists about the same centre, ``centres`` (c, 3) float32 in their frame. The common
+    normal is that of the mean of the two covariance matrices, each about its own mean: neither epoch outweighs the
+    other, and a displaced surface keeps its direction.
+    """
+    runs_b, runs_a = empty_runs(before, radius), empty_runs(after, radius)
+    points_b, points_a = np.empty((256, 3)), np.empty((256, 3))
+    for c in range(start, stop):
+        x, y, z = centres[c, 0], centres[c, 1], centres[c, 2]
+        points_b, n_b = _gather(before, x, y, z, radius, runs_b, points_b)
+        points_a, n_a = _gather(after, x, y, z, radius, runs_a, points_a)
+        n_points[c, 0], n_points[c, 1] = n_b, n_a
+        if n_b < min_points or n_a < min_points:
+            continue
+        own_b, own_a = _covariance(points_b, n_b), _covariance(points_a, n_a)
+        mean = 0.5 * (own_b + own_a)
+        large, middle, small, nx, ny, nz = eigen_symmetric_3x3(mean[0], mean[1], mean[2], mean[3], mean[4], mean[5])
+        if middle <= LINE * large or small > max_isotropy * middle:
+            continue
+        normal[c, 0], normal[c, 1], normal[c, 2] = nx, ny, nz
+        offset[c, 0], sigma[c, 0] = _offset_and_noise(points_b, n_b, nx, ny, nz)
+        offset[c, 1], sigma[c, 1] = _offset_and_noise(points_a, n_a, nx, ny, nz)
+        is_valid[c] = True
+
+
+@njit(nogil=True, cache=True)
+def _gather(cells, x, y, z, radius, runs, points):  # type: ignore[no-untyped-def]
+    """Points within ``radius``, about (x, y, z), in a buffer that is enlarged where needed; how many."""
+    n_runs = runs_within(cells, x, y, z, radius, runs)
+    n_most = 0
+    for r in range(n_runs):
+        n_most += runs[r, 1] - runs[r, 0]
+    if n_most > len(points):
+        points = np.empty((2 * n_most, 3))
+    n = 0
+    for r in range(n_runs):
+        for p in range(runs[r, 0], runs[r, 1]):
+            if sq_distance(cells, p, x, y, z) <= radius * radius:
+                points[n, 0] = np.float64(cells.xyz[p, 0]) - np.float64(x)
+                points[n, 1] = np.float64(cells.xyz[p, 1]) - np.float64(y)
+                points[n, 2] = np.float64(cells.xyz[p, 2]) - np.float64(z)
+                n += 1
+    return points, n
+
+
+@njit(nogil=True, cache=True)
+def _covariance(points, n):  # type: ignore[no-untyped-def]
+    """xx, xy, xz, yy, yz, zz of the first ``n`` points about their mean."""
+    mx, my, mz = 0.0, 0.0, 0.0
+    for p in range(n):
+        mx += points[p, 0]
+        my += points[p, 1]
+        mz += points[p, 2]
+    mx, my, mz = mx / n, my / n, mz / n
+    total = np.zeros(6)
+    for p in range(n):
+        x, y, z = points[p, 0] - mx, points[p, 1] - my, points[p, 2] - mz
+        total[0] += x * x
+        total[1] += x * y
+        total[2] += x * z
+        total[3] += y * y
+        total[4] += y * z
+        total[5] += z * z
+    return total / n
+
+
+@njit(nogil=True, cache=True)
+def _offset_and_noise(points, n, nx, ny, nz):  # type: ignore[no-untyped-def]
+    """Trimmed mean offset along the normal and its standard deviation from the MAD, both in m."""
+    along = np.empty(n)
+    for p in range(n):
+        along[p] = points[p, 0] * nx + points[p, 1] * ny + points[p, 2] * nz
+    middle = np.median(along)
+    sigma = MAD_TO_STD * np.median(np.abs(along - middle))
+    total, count = 0.0, 0
+    for p in range(n):
+        if abs(along[p] - middle) <= TRIM * sigma:
+            total += along[p]
+            count += 1
+    return (total / count if count > 0 else middle), sigma

@@ -1,0 +1,112 @@
+"""Limit of detection at 95 % along the local normal, on a sparse 3D grid (paper, section 4.1, equation 2)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from loda_pdal.kernels.lod_pooling import pool_range
+from loda_pdal.kernels.neighbours import build_cells, middle_of, to_cell_frame
+from loda_pdal.kernels.parallel import run_ranges
+from loda_pdal.model.cloud import FloatArray
+from loda_pdal.model.grid import cells_of
+from loda_pdal.model.groups import unique_rows
+from loda_pdal.model.lod_grid import LodGrid
+from loda_pdal.params import LodParams
+from loda_pdal.stages.drift import SURFACE_NOISE_M, drift_covariance, rigid_part
+
+Z_95 = 1.96
+"""Two-sided 95 % of the normal distribution."""
+
+SMALL_SAMPLE = 4.0
+"""The noise of N points about a plane fitted to them is taken 1 + 4 / N times larger: for the freedom the plane takes,
+the bias and the spread of the MAD, and the tails of Student's distribution. Without it the limit of independent normal
+noise holds in 87, 91, 92 and 94 % of the cells for N of 12, 25, 50 and 100; with it in 94 or 95 %."""
+
+
+def level_of_detection(
+    before_xyz: FloatArray, after_xyz: FloatArray, covariance: FloatArray, centre: FloatArray, params: LodParams
+) -> LodGrid:
+    """LoD95 and the displacement along the common normal, in every cell that either epoch occupies.
+
+    Parameters
+    ----------
+    before_xyz, after_xyz : (m, 3) float64, m
+        Fused points of both epochs, registered to each other.
+    covariance : (6, 6) float64
+        Of the twist (tx, ty, tz, rx, ry, rz) left between them, m and rad, in the frame of the points.
+    centre : (3,) float64, m
+        Where the twist turns.
+    params : LodParams
+
+    Returns
+    -------
+    LodGrid
+        Cells of low observability (paper) hold ``low_observability_m`` and are not valid.
+
+    References
+    ----------
+    Paper, section 4.1, equation 2; METHOD 1.4 to 1.6: cells in 3D, full pose covariance, noise of each epoch about
+    its own plane. Beyond the paper: small samples and drift (see `drift`), without which 95 % would not be 95 %.
+    """
+    cells = unique_rows(cells_of(np.vstack([before_xyz, after_xyz]), params.cell_m))
+    n_cells = len(cells)
+    centres = np.asarray((cells + 0.5) * params.cell_m, dtype=np.float64)
+    n_points = np.zeros((n_cells, 2), np.int32)
+    normal, is_valid = np.zeros((n_cells, 3)), np.zeros(n_cells, np.bool_)
+    sigma, offset = np.full((n_cells, 2), np.nan), np.full((n_cells, 2), np.nan)
+    local = middle_of(centres)
+    before, after = (build_cells(xyz, params.radius_m / 2, local) for xyz in (before_xyz, after_xyz))
+    if len(before_xyz) and len(after_xyz):  # a cell list without points has nothing to look in
+        run_ranges(
+            pool_range,
+            n_cells,
+            before,
+            after,
+            to_cell_frame(before, centres),
+            params.radius_m,
+            params.min_points,
+            params.max_isotropy,
+            n_points,
+            normal,
+            sigma,
+            offset,
+            is_valid,
+        )
+    n = np.maximum(n_points, 1)
+    widened = 1.0 + (SMALL_SAMPLE if params.small_sample else 0.0) / n
+    variance = np.asarray(np.sum((sigma * widened) ** 2 / n, axis=1), dtype=np.float64)
+    displacement = np.where(is_valid, offset[:, 1] - offset[:, 0], np.nan)
+    jacobian = pose_jacobian(centres, normal, centre, params.pose_term)
+    drift = np.zeros((3, 3))
+    if params.drift_term == "measured":
+        is_surface = is_valid & (np.nan_to_num(sigma).max(axis=1) <= SURFACE_NOISE_M)
+        noise, along = variance[is_surface], displacement[is_surface]
+        along = along - rigid_part(along, noise, jacobian[is_surface], covariance)
+        drift = drift_covariance(along, noise, normal[is_surface], params.max_drift_m)
+    variance += np.einsum("ki,ij,kj->k", jacobian, covariance, jacobian)
+    variance += np.einsum("ki,ij,kj->k", normal, drift, normal)
+    limit = Z_95 * np.sqrt(variance)
+    if params.variation == "global" and is_valid.any():
+        limit = np.full(n_cells, np.median(limit[is_valid]))
+    return LodGrid(
+        cells=cells.astype(np.int32),
+        cell_m=params.cell_m,
+        lod95=np.where(is_valid, limit, params.low_observability_m).astype(np.float32),
+        normal=normal.astype(np.float32),
+        n_before=n_points[:, 0].copy(),
+        n_after=n_points[:, 1].copy(),
+        is_valid=is_valid,
+        displacement=displacement.astype(np.float32),
+        low_observability_m=params.low_observability_m,
+        drift=drift,
+    )
+
+
+def pose_jacobian(xyz: FloatArray, normal: FloatArray, centre: FloatArray, pose_term: str) -> FloatArray:
+    """Displacement along ``normal`` (k, 3) at points (k, 3) per twist about ``centre``: (k, 6).
+
+    ``full`` is n' [I, -[p - c]x] (METHOD 1.4); ``translation``, the paper's, leaves the turn out; ``none`` is zero.
+    """
+    turn = np.cross(xyz - centre, normal)
+    has_shift, has_turn = float(pose_term != "none"), float(pose_term == "full")
+    return np.hstack([normal * has_shift, turn * has_turn])
