@@ -191,7 +191,9 @@ def model_ground(clouds: Pair[VoxelCloud], p: Parameters) -> Pair[Ground]:
 
 def limit_of_detection(clouds: Pair[VoxelCloud], registration: Registration, p: Parameters) -> LodGrid:
     """LoD95 on a sparse grid (equation 2)."""
-    return level_of_detection(clouds.before.xyz, clouds.after.xyz, registration.covariance, registration.centre, p.lod)
+    return level_of_detection(
+        clouds.before.xyz, clouds.after.xyz, registration.covariance_in_frame, registration.centre_in_frame, p.lod
+    )
 
 
 def match_proxies(clouds: Pair[VoxelCloud], ground: Pair[Ground], p: Parameters) -> ProxyMatches | None:

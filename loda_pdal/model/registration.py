@@ -65,6 +65,17 @@ class Registration:
         return invert(self.T_frame_after)
 
     @property
+    def covariance_in_frame(self) -> FloatArray:
+        """`covariance` turned into the analysis frame, (6, 6)."""
+        R = np.kron(np.eye(2), self.vertical[:3, :3])
+        return np.asarray(R @ self.covariance @ R.T)
+
+    @property
+    def centre_in_frame(self) -> FloatArray:
+        """`centre` in the analysis frame, (3,) m."""
+        return np.asarray(self.vertical[:3, :3] @ self.centre)
+
+    @property
     def shift_m(self) -> FloatArray:
         """How far the centre moves, before to after, (3,) m."""
         moved = self.T_after_before[:3, :3] @ self.centre + self.T_after_before[:3, 3]
