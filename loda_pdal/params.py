@@ -418,8 +418,9 @@ class ChangeParams(StageParams):
         high=1000,
     )
     replaced_m: float = param(
-        0.25,
-        "height difference or displacement above which a parked vehicle is another one; 0: never",
+        0.15,
+        "difference of the tops that makes a parked vehicle another one, where its surface moved by half of that; "
+        "0: never",
         unit="m",
         low=0,
         high=10,

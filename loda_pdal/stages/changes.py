@@ -145,6 +145,7 @@ class Cue(NamedTuple):
     d_typical: float
     gained_above: float
     lost_above: float
+    column_rise: float
     lod95: float
     observability: float
     rise: float
@@ -182,13 +183,9 @@ def _is_no_pair(cue: Cue, params: ChangeParams) -> bool:
     if cue.object_class == ObjectClass.VEGETATION:
         return cue.iou <= params.vegetation_iou or (cue.shift >= params.vegetation_shift_m and _is_apart(cue, params))
     if cue.object_class == ObjectClass.MOBILE and params.replaced_m > 0:
-        is_other_shape = abs(cue.dh) > params.replaced_m or cue.d_typical > params.replaced_m
-        return is_other_shape and min(cue.support_before, cue.support_after) < _SAME_VEHICLE
+        is_elsewhere = cue.d_typical > params.replaced_m / 2 or min(cue.support_before, cue.support_after) < 0.8
+        return abs(cue.dh) > params.replaced_m and is_elsewhere
     return False
-
-
-_SAME_VEHICLE = 0.85
-"""A vehicle of which both surveys share more of the surface than this is the same, whatever its top."""
 
 
 def _is_apart(cue: Cue, params: ChangeParams) -> bool:
@@ -258,8 +255,10 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
     least_above = max(least, params.backing_share * cue.n_voxels)
     has_height = params.use_height and abs(cue.dh) > max(gate, height_m)  # NaN is never above
     has_volume = params.use_volume and abs(cue.dv_ratio) > ratio
-    rises = has_height and cue.dh > 0 and (least == 0 or cue.gained_above >= least_above)
-    sinks = has_height and cue.dh < 0 and (least == 0 or cue.lost_above >= least_above)
+    is_raised = least == 0 or cue.gained_above >= least_above or cue.column_rise > height_m / 2
+    is_lowered = least == 0 or cue.lost_above >= least_above or cue.column_rise < -height_m / 2
+    rises = has_height and cue.dh > 0 and is_raised
+    sinks = has_height and cue.dh < 0 and is_lowered
     swells = has_volume and cue.dv_ratio > 0 and (least == 0 or cue.gained >= max(least, cue.lost))
     shrinks = has_volume and cue.dv_ratio < 0 and (least == 0 or cue.lost >= max(least, cue.gained))
     figures = _figures(cue, height_m, ratio, gate)
@@ -310,7 +309,7 @@ def _raw(cue: Cue, verdict: Verdict, is_apart: bool, params: ChangeParams, confi
         overlap=cue.iou,
         shift=cue.shift / max(shift_m, 1e-9),
         displacement=cue.d_perp / max(params.lod_factor * cue.lod95, params.displacement_m, 1e-9),
-        support=0.0 if is_apart else cue.support_after if cue.is_after else cue.support_before,
+        support=0.0 if is_apart else cue.support_before if verdict.label == ChangeLabel.REMOVED else cue.support_after,
         observability=cue.observability,
         params=confidence,
     )

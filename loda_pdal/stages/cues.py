@@ -120,6 +120,8 @@ class Evidence:
     gained, lost
         Voxels that only the after, or only the before epoch has, where the other could have seen them;
         ``gained_above`` and ``lost_above`` are those beyond the other epoch's top.
+    column_rise : m
+        Median change of the top over the columns that both epochs occupy; NaN with fewer than eight of them.
     iou, shift : 3D overlap of the occupancy, and distance of the centroids (m).
     dh : m
         Change of the height that the parameters name.
@@ -151,6 +153,7 @@ class Evidence:
     d_typical: FloatArray
     gained_above: FloatArray
     lost_above: FloatArray
+    column_rise: FloatArray
     lod95: FloatArray
     observability: FloatArray
     rise: FloatArray
@@ -240,7 +243,11 @@ def weigh(
     lowest = points.join(surfaces, lambda group, surface: group.minimum(surface.xyz[:, 2]))
     highest = points.join(surfaces, lambda group, surface: group.maximum(surface.xyz[:, 2]))
     height = points.join(surfaces, lambda group, surface: group.quantile(surface.height, 0.95))
-    summit = _tops(surfaces, coverage, n, params.voxel_m)
+    columns = Pair(
+        _column_tops(surfaces.before, coverage.after if coverage else None, params.voxel_m),
+        _column_tops(surfaces.after, coverage.before if coverage else None, params.voxel_m),
+    )
+    summit = columns.map(lambda side: Groups(side.column[:, 0], n).quantile(side.top, 0.95))
     top = height if params.height_reference == "ground" else summit
     middle = (cells.cell + 0.5) * params.voxel_m
     centroid = own.join(is_known, lambda side, known: Groups(np.where(known, side, -1), n).mean(middle))
@@ -261,6 +268,7 @@ def weigh(
         d_typical=np.where(is_sampled, samples.median(np.abs(displacement)), np.nan),
         gained_above=_count(own.after, cells.is_gained & _is_above(middle[:, 2], own.after, summit.before), n),
         lost_above=_count(own.before, cells.is_lost & _is_above(middle[:, 2], own.before, summit.after), n),
+        column_rise=_column_rise(columns, n),
         lod95=Groups(owner, n).median(cells.lod95[voxel]),
         observability=(n_known.before + n_known.after) / np.maximum(n_voxels.before + n_voxels.after, 1),
         rise=_rise(cells, middle[:, 2], n),
@@ -345,28 +353,43 @@ def _facing(normal: FloatArray, samples: Groups) -> FloatArray:
     return np.where(along < 0, -1.0, 1.0)
 
 
-def _tops(surfaces: Pair[Surface], coverage: Pair[Coverage] | None, n: int, cell_m: float) -> Pair[FloatArray]:
-    """Height of the top (n,) m of each object in each epoch: 95th percentile of its columns' highest points.
+class _Columns(NamedTuple):
+    """Columns (k, 3) of an epoch's objects as rows (object, ix, iy), sorted, and their highest points (k,) m."""
 
-    Only columns that the other epoch saw count, so that a part which one survey never saw is no growth.
+    column: Int64Array
+    top: FloatArray
+
+
+def _column_tops(surface: Surface, other: Coverage | None, cell_m: float) -> _Columns:
+    """Highest point in each column of each object, in the columns that the other epoch saw.
+
+    A part that one survey never saw is no growth.
     """
+    is_in = surface.owner >= 0
+    if other is not None:
+        is_in &= other.at(surface.xyz)
+    column = np.column_stack([surface.owner[is_in], cells_of(surface.xyz[is_in, :2], cell_m)])
+    z = surface.xyz[is_in, 2]
+    order = np.lexsort((z, column[:, 2], column[:, 1], column[:, 0]))
+    column, z = column[order], z[order]
+    is_last = np.ones(len(z), np.bool_)
+    is_last[:-1] = np.any(column[1:] != column[:-1], axis=1)
+    return _Columns(column[is_last], z[is_last])
 
-    def top(surface: Surface, other: Coverage | None) -> FloatArray:
-        is_in = surface.owner >= 0
-        if other is not None:
-            is_in &= other.at(surface.xyz)
-        column = np.column_stack([surface.owner[is_in], cells_of(surface.xyz[is_in, :2], cell_m)])
-        z = surface.xyz[is_in, 2]
-        order = np.lexsort((z, column[:, 2], column[:, 1], column[:, 0]))
-        column, z = column[order], z[order]
-        is_last = np.ones(len(z), np.bool_)
-        is_last[:-1] = np.any(column[1:] != column[:-1], axis=1)
-        return Groups(column[is_last, 0], n).quantile(z[is_last], 0.95)
 
-    return Pair(
-        top(surfaces.before, coverage.after if coverage else None),
-        top(surfaces.after, coverage.before if coverage else None),
-    )
+def _column_rise(columns: Pair[_Columns], n: int) -> FloatArray:
+    """Median change of the columns' tops (n,) m over the columns that both epochs have."""
+    if len(columns.before.column) == 0 or len(columns.after.column) == 0:
+        return np.full(n, np.nan)
+    lattice = Lattice.around(np.concatenate([side.column for side in columns]))
+    found = lattice.find(lattice.keys(columns.before.column), columns.after.column)
+    is_both = found >= 0
+    groups = Groups(columns.after.column[is_both, 0], n)
+    rise = groups.median(columns.after.top[is_both] - columns.before.top[found[is_both]])
+    return np.where(groups.counts >= _LEAST_COLUMNS, rise, np.nan)
+
+
+_LEAST_COLUMNS = 8
 
 
 def _is_above(z: FloatArray, owner: IntArray, top: FloatArray) -> BoolArray:
