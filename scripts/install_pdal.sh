@@ -21,7 +21,7 @@ if_possible=0
 [ "${1:-}" = --if-possible ] && if_possible=1
 
 # The stage's own question: can a filters.python stage of this pdal import loda_pdal?
-is_working() { "$venv/bin/python" -m loda_pdal.pdal_face >/dev/null 2>&1; }
+is_working() { "$venv/bin/python" -m loda_pdal.pdal_face 2>/dev/null; }
 if is_working; then exit 0; fi
 
 [ "$(. /etc/os-release 2>/dev/null && echo "${ID:-}${VERSION_ID:-}")" = debian12 ] || give_up "this is not Debian 12."
@@ -135,4 +135,3 @@ echo "Installing a private PDAL with its Python plugin into .pdal (about a minut
 [ -x "$prefix/bin/pdal" ] || install_libraries
 install_plugin
 is_working || { "$venv/bin/python" -m loda_pdal.pdal_face || true; give_up "the installed program does not work."; }
-"$venv/bin/python" -m loda_pdal.pdal_face

@@ -191,9 +191,7 @@ def read_epochs(
     xyz = sources.join(infos, _map_coordinates)
     frame = common_frame(xyz, crs)
     local = xyz.map(frame.to_local)
-    for info, points in ((infos.before, local.before), (infos.after, local.after)):
-        _check_extent(_short_name(info), len(points), np.ptp(points, axis=0))
-    _check_overlap(infos.map(_short_name), local)
+    check_coverage(infos.map(_short_name), local)
     return Pair(
         Survey(local.before, frame, infos.before.path, sources.before, crs.notes.before),
         Survey(local.after, frame, infos.after.path, sources.after, crs.notes.after),
@@ -205,6 +203,15 @@ def common_frame(xyz: Pair[FloatArray], crs: MapCrs) -> LocalFrame:
     low = np.minimum(xyz.before[:, :2].min(axis=0), xyz.after[:, :2].min(axis=0))
     x, y = (int(v) for v in np.floor(low / ORIGIN_STEP) * ORIGIN_STEP)
     return LocalFrame((x, y, 0), crs.unit_xy_m, crs.unit_z_m, crs.wkt)
+
+
+def check_coverage(names: Pair[str], local: Pair[FloatArray]) -> None:
+    """`InputError` where two clouds (n, 3), m, spread absurdly for their number of points, or hardly overlap."""
+    for name, points in zip(names, local, strict=True):
+        _check_extent(name, len(points), np.ptp(points, axis=0))
+    share = plan_overlap(local.before, local.after)
+    if share < MIN_OVERLAP:
+        raise _no_overlap(names, f"they share {100 * share:.0f} % of the smaller one's area in plan")
 
 
 def plan_overlap(before: FloatArray, after: FloatArray) -> float:
@@ -392,12 +399,6 @@ def map_coordinates(points: Any, scale: Any, offset: Any) -> FloatArray:
         return np.column_stack(
             [points[axis] * float(s) + float(o) for axis, s, o in zip("XYZ", scale, offset, strict=True)]
         )
-
-
-def _check_overlap(names: Pair[str], local: Pair[FloatArray]) -> None:
-    share = plan_overlap(local.before, local.after)
-    if share < MIN_OVERLAP:
-        raise _no_overlap(names, f"they share {100 * share:.0f} % of the smaller one's area in plan")
 
 
 def _no_overlap(names: Pair[str], found: str) -> InputError:
