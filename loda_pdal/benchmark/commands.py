@@ -79,3 +79,21 @@ def score(run_dir: Path, truth_json: Path, as_json: bool, markdown: Path | None)
     if markdown is not None:
         markdown.write_text(tables + "\n", encoding="utf-8")
     click.echo(json.dumps(report.to_dict()) if as_json else tables)
+
+
+@bench.command()
+@click.option("--first", type=click.IntRange(0), default=101, show_default=True, help="First seed.")
+@click.option(
+    "--last", type=click.IntRange(0), default=130, show_default=True, help="Last seed; test seeds are skipped."
+)
+@click.option("--preset", default="street", show_default=True, help="Parameters whose confidence is calibrated.")
+def calibrate(first: int, last: int, preset: str) -> None:
+    """Fit the calibration of the confidence on simulated training blocks and check it on validation blocks."""
+    from loda_pdal.benchmark.calibrate import fit, judge_blocks
+    from loda_pdal.params import Parameters
+
+    found = fit(list(judge_blocks(range(first, last + 1), Parameters.preset(preset))))
+    for name, (offset, slope) in found.values.items():
+        click.echo(f"confidence.{name} = [{offset}, {slope}]")
+    click.echo(f"training: {found.n_train} objects, expected calibration error {found.error_train:.3f}")
+    click.echo(f"validation: {found.n_validation} objects, expected calibration error {found.error_validation:.3f}")
