@@ -66,7 +66,7 @@ def test_most_planted_edits_are_found(block: SimulatedBlock, result: ChangeResul
         right += int(votes.argmax() == instance.label)
         n += 1
     assert n >= 8
-    assert right >= 0.7 * n
+    assert right >= 0.7 * n, f"{right} of {n}"
 
 
 def test_the_result_is_complete(block: SimulatedBlock, result: ChangeResult) -> None:

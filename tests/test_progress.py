@@ -26,6 +26,12 @@ LIMIT_S = 2.0
 WRITING = "writing the results"
 
 
+@pytest.fixture(autouse=True)
+def own_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What ``--threads`` leaves in the environment ends with the test."""
+    monkeypatch.setenv("LODA_THREADS", "")
+
+
 @pytest.fixture(scope="module")
 def block(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short simulated street, surveyed twice."""
@@ -264,3 +270,20 @@ def test_terminal_gets_its_cursor_back_after_ctrl_c(block: Path, tmp_path: Path)
     os.close(ours)
     process.communicate()
     assert code == 130 and seen.rindex(b"\x1b[?25h") > seen.rindex(b"\x1b[?25l")
+
+
+def test_signal_during_a_pipeline_leaves_no_file(block: Path, tmp_path: Path, pipelines_dir: Path) -> None:
+    out = tmp_path / "out.laz"
+    command = [sys.executable, "-m", "loda_pdal", "pipeline", str(pipelines_dir / "change.json"), "--progress", "json"]
+    command += ["--engine", "embedded", f"--stage.before.filename={block / 'before.laz'}"]
+    command += [f"--stage.after.filename={block / 'after.laz'}", f"--stage.output.filename={out}"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+    assert process.stdout is not None
+    for line in process.stdout:
+        if "superpoints" in json.loads(line).get("stage", ""):
+            break
+    process.terminate()
+    assert ends_within(process, LIMIT_S) == 143
+    _, said = process.communicate()
+    assert said.endswith("loda-pdal: stopped.\n")
+    assert not [path for path in tmp_path.rglob("*") if path.suffix in (".laz", ".las") or "part" in path.name]

@@ -118,11 +118,10 @@ def _run(
     from loda_pdal.io.outputs import abandon_outputs, write_outputs
     from loda_pdal.io.summary import summarise
     from loda_pdal.kernels import is_cache_warm
-    from loda_pdal.kernels.parallel import set_threads
     from loda_pdal.pipeline import STEPS, detect_changes
 
     stopping.before_stopping(abandon_outputs)
-    set_threads(threads)
+    options.use_threads(threads)
     if not is_cache_warm():
         reporter.info("The first run compiles its kernels, once; that takes about a minute.")
     started, total = datetime.now(tz=UTC), len(STEPS) + 1

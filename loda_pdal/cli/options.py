@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -48,6 +49,12 @@ def chosen_parameters(preset: str | None, params_file: Path | None, settings: Se
     for setting in settings:
         chosen = chosen.with_setting(setting)
     return chosen
+
+
+def use_threads(n: int | None) -> None:
+    """Let kernels run in ``n`` threads, here and in programs that we start; None leaves the choice to them."""
+    if n is not None:
+        os.environ["LODA_THREADS"] = str(n)
 
 
 as_json = click.option("--json", "as_json", is_flag=True, help="Write the result as JSON to stdout.")

@@ -46,11 +46,10 @@ def pipeline(
     with reporter_for(progress_kind) as reporter:
         if progress_kind == "json":
             stopping.when_parent_dies()
-        from loda_pdal.kernels.parallel import set_threads
         from loda_pdal.pdal_face import run_pipeline, stop_pdal
 
         stopping.before_stopping(stop_pdal)
-        set_threads(threads)
+        options.use_threads(threads)
         done = run_pipeline(file, overrides, engine=engine, validate=validate, progress=reporter.progress)
         if done.is_validated_only:
             reporter.info("Everything is in order; nothing was computed.")

@@ -12,12 +12,14 @@ import numpy as np
 import numpy.typing as npt
 
 from loda_pdal.io.colours import rgb
-from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, Int64Array
+from loda_pdal.model.cloud import BoolArray, ByteArray, Float32Array, FloatArray, Int64Array
 
-RAMP = 40
+RAMP = 32
 """Shades per ramp of a picture's palette."""
 
 PAPER = (250, 250, 248)
+_NOTHING = np.float32(-1e6)
+"""Depth where no point is drawn, m."""
 _CONTEXT_RAMP = ((52, 58, 66), (226, 228, 230))
 
 
@@ -72,24 +74,27 @@ def draw_points(
     is_drawn : (rows, columns) bool
         Where there is a point at all.
     """
-    rows, columns = view.shape
-    nearest = np.full(rows * columns, -np.inf)
-    colour = np.zeros(rows * columns)
-    order = np.argsort(depth, kind="stable")
-    column = np.floor((u[order] - view.u0) / view.pixel_m).astype(np.int64)
-    row = rows - 1 - np.floor((v[order] - view.v0) / view.pixel_m).astype(np.int64)
-    depth, tone = depth[order], tone[order]
     size = min(24, max(1, math.ceil(point_m / view.pixel_m)))
-    for shift in _disc(size):
-        i, j = row + shift[0] - size // 2, column + shift[1] - size // 2
-        is_inside = (i >= 0) & (i < rows) & (j >= 0) & (j < columns)
-        pixel = (i * columns + j)[is_inside]
-        is_nearer = depth[is_inside] > nearest[pixel]
+    rows, columns = view.shape
+    stride = columns + 2 * size  # a margin around the picture, where dots may end without being looked after
+    column = np.floor((u - view.u0) / view.pixel_m) + size
+    row = rows - 1 - np.floor((v - view.v0) / view.pixel_m) + size
+    reach = size // 2 + 1
+    is_near = (row >= reach) & (row < rows + 2 * size - reach) & (column >= reach) & (column < stride - reach)
+    order = np.flatnonzero(is_near)[np.argsort(depth[is_near], kind="stable")]
+    base = row[order].astype(np.int64) * stride + column[order].astype(np.int64)
+    depth, tone = depth[order].astype(np.float32), tone[order].astype(np.float32)
+    nearest = np.full((rows + 2 * size) * stride, _NOTHING)
+    colour = np.zeros(len(nearest), dtype=np.float32)
+    for i, j in _disc(size):
+        pixel = base + ((i - size // 2) * stride + j - size // 2)
+        is_nearer = depth >= nearest[pixel]
         pixel = pixel[is_nearer]
-        nearest[pixel] = depth[is_inside][is_nearer]  # sorted by depth: of equal pixels the nearest comes last
-        colour[pixel] = tone[is_inside][is_nearer]
-    is_drawn = np.isfinite(nearest).reshape(rows, columns)
-    return colour.reshape(rows, columns) * _eye_dome(nearest.reshape(rows, columns), is_drawn), is_drawn
+        nearest[pixel] = depth[is_nearer]  # sorted by depth: of equal pixels the nearest comes last
+        colour[pixel] = tone[is_nearer]
+    inside = np.s_[size : size + rows, size : size + columns]
+    nearest, colour = (values.reshape(-1, stride)[inside] for values in (nearest, colour))
+    return (colour * _eye_dome(nearest)).astype(np.float64), nearest > _NOTHING
 
 
 def _disc(size: int) -> list[tuple[int, int]]:
@@ -98,19 +103,16 @@ def _disc(size: int) -> list[tuple[int, int]]:
     return [(i, j) for i, j in np.ndindex(size, size) if math.hypot(i - middle, j - middle) <= radius]
 
 
-def _eye_dome(nearest: FloatArray, is_drawn: BoolArray) -> FloatArray:
+def _eye_dome(nearest: Float32Array) -> Float32Array:
     """Shade (rows, columns) 0 to 1: darker where neighbours stand nearer to the viewer (eye-dome lighting)."""
-    filled = np.where(is_drawn, nearest, -np.inf)
-    hidden = np.zeros_like(filled)
+    rows, columns = nearest.shape
+    hidden = np.zeros_like(nearest)
     for reach in (1, 3):
-        padded = np.pad(filled, reach, constant_values=-np.inf)
-        rows, columns = filled.shape
+        padded = np.pad(nearest, reach, constant_values=_NOTHING)
         for di, dj in ((0, 1), (1, 0), (1, 2), (2, 1), (0, 0)):  # upper left twice: light comes from there
             i, j = di * reach, dj * reach
-            with np.errstate(invalid="ignore"):
-                nearer = padded[i : i + rows, j : j + columns] - filled
-            hidden += np.clip(np.nan_to_num(nearer, nan=0.0, posinf=0.0, neginf=0.0), 0.0, 1.5)
-    return np.exp(-0.16 * hidden)
+            hidden += np.clip(padded[i : i + rows, j : j + columns] - nearest, 0.0, 1.5)
+    return np.asarray(np.exp(-0.16 * hidden))
 
 
 def compose(shape: tuple[int, int], *layers: tuple[FloatArray, BoolArray, int]) -> ByteArray:

@@ -26,8 +26,10 @@ from loda_pdal.model.records import ChangeResult, GroundChangeRecord, ObjectReco
 from loda_pdal.model.survey import Survey
 from loda_pdal.params import Parameters
 
-MAX_PICTURED = 200
-"""Changes shown with pictures; the table lists more."""
+MAX_PICTURED = 150
+"""Changed objects shown with pictures, at 50 to 100 kB each; the table lists more."""
+MAX_PICTURED_GROUND = 30
+"""Pieces of changed ground shown with pictures; the map has all."""
 MAX_LISTED = 3000
 """Changes listed in the table; changes.gpkg holds all."""
 MAX_OUTLINES = 4000
@@ -121,7 +123,7 @@ def render(data: ReportData) -> str:
     scene = Scene.of(data.clouds, data.object_of_point, data.parameters.fuse.leaf_m)
     changes = ranked(data.objects)
     pictured = changes[:MAX_PICTURED]
-    ground = sorted(data.ground_changes, key=lambda r: -abs(r.volume_m3))[:MAX_PICTURED]
+    ground = sorted(data.ground_changes, key=lambda r: (-abs(r.volume_m3), r.ground_change_id))[:MAX_PICTURED_GROUND]
     assets = files("loda_pdal.io") / "report_assets"
     title = _title(data.figures)
     body = "".join(
@@ -194,8 +196,9 @@ def _class(kind: ObjectClass) -> str:
     return CLASS_WORDS.get(kind, kind.title)
 
 
-def _chip(label: ChangeLabel) -> str:
-    return f'<span class="chip"><i class="swatch" style="--c:{LABEL_COLOURS[label]}"></i>{label.title}</span>'
+def _chip(label: ChangeLabel, text: str = "") -> str:
+    """A colour with its label, or with another word for it."""
+    return f'<span class="chip"><i class="swatch" style="--c:{LABEL_COLOURS[label]}"></i>{text or label.title}</span>'
 
 
 def _day(text: str) -> str:
@@ -506,7 +509,7 @@ def _ground(records: list[GroundChangeRecord], n_all: int, scene: Scene, frame: 
         ]
         cards.append(
             f'<article class="card" id="g{record.ground_change_id}" data-label="{record.label.title}" '
-            f'style="--c:{LABEL_COLOURS[record.label]}"><div><h3>{_chip(record.label)} ground {word} '
+            f'style="--c:{LABEL_COLOURS[record.label]}"><div><h3>{_chip(record.label, f"Ground {word}")} '
             f'<small>no. {record.ground_change_id}</small></h3><p class="why">{_sentence(record.reason)}</p>'
             f"{_facts(facts)}</div>{ground_pictures(scene, record.label, record.footprint)}</article>"
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from pyogrio.errors import DataLayerError, DataSourceError
 
 from loda_pdal.io.report import ReportData, render
 from loda_pdal.io.transform import read_map_transform
-from loda_pdal.model.cloud import FloatArray
+from loda_pdal.model.cloud import FloatArray, Int64Array
 from loda_pdal.model.errors import InputError, OutputError
 from loda_pdal.model.frame import LocalFrame
 from loda_pdal.model.labels import ChangeLabel, ObjectClass
@@ -158,33 +159,57 @@ def _ground_changes(path: Path, frame: LocalFrame) -> list[GroundChangeRecord]:
 def _points(
     path: Path, frame: LocalFrame, leaf_m: float, T_map: FloatArray
 ) -> tuple[Pair[FloatArray], Pair[UIntArray]]:
-    """One point per voxel and object of each epoch in local metres, read piece by piece.
+    """The mean point of every voxel and object of each epoch in local metres, noise left out, read piece by piece.
 
     ``T_map`` (4, 4) moves the before-points of the file, in full map coordinates, onto the after epoch.
     """
-    kept: dict[int, list[tuple[FloatArray, UIntArray]]] = {0: [], 1: []}
+    parts: dict[int, list[_Fused]] = {0: [_Fused.nothing()], 1: [_Fused.nothing()]}
     with laspy.open(path) as reader:
         for points in reader.chunk_iterator(CHUNK):
-            xyz, objects = np.column_stack([points.x, points.y, points.z]), np.asarray(points["ObjectId"])
-            epochs = np.asarray(points["Epoch"])
-            for epoch, parts in kept.items():
+            full, objects = np.column_stack([points.x, points.y, points.z]), np.asarray(points["ObjectId"])
+            epochs = np.where(np.asarray(points.classification) == ObjectClass.NOISE, -1, points["Epoch"])
+            for epoch, fused in parts.items():
                 is_here = epochs == epoch
-                full = xyz[is_here] if epoch else transform_points(T_map, xyz[is_here])
-                parts.append(_thinned(frame.to_local(full), objects[is_here].astype(np.uint32), leaf_m))
-    clouds = []
-    for parts in kept.values():
-        empty = (np.empty((0, 3)), np.empty(0, dtype=np.uint32))
-        xyz, objects = (np.concatenate(column) for column in zip(empty, *parts, strict=True))
-        clouds.append(_thinned(xyz, objects, leaf_m))
-    before, after = clouds
-    return Pair(before[0], after[0]), Pair(before[1], after[1])
+                moved = full[is_here] if epoch else transform_points(T_map, full[is_here])
+                fused.append(_Fused.of(frame.to_local(moved), objects[is_here], leaf_m))
+    before, after = (_Fused.joined(fused) for fused in parts.values())
+    return Pair(before.means, after.means), Pair(before.objects, after.objects)
 
 
-def _thinned(xyz: FloatArray, objects: UIntArray, leaf_m: float) -> tuple[FloatArray, UIntArray]:
-    """The first point of every voxel and object."""
-    cells = np.column_stack([np.floor(xyz / leaf_m).astype(np.int64), objects.astype(np.int64)])
-    order = np.lexsort(cells.T)
-    is_first = np.ones(len(order), dtype=bool)
-    is_first[1:] = np.any(cells[order][1:] != cells[order][:-1], axis=1)
-    first = np.sort(order[is_first])
-    return xyz[first], objects[first]
+@dataclass(frozen=True)
+class _Fused:
+    """Sums of points: ``cells`` (k, 4) int64 voxel and object, sorted and unique; ``sums`` (k, 3) m; ``n`` (k,)."""
+
+    cells: Int64Array
+    sums: FloatArray
+    n: Int64Array
+
+    @classmethod
+    def nothing(cls) -> _Fused:
+        return cls(np.empty((0, 4), dtype=np.int64), np.empty((0, 3)), np.empty(0, dtype=np.int64))
+
+    @classmethod
+    def of(cls, xyz: FloatArray, objects: UIntArray, leaf_m: float) -> _Fused:
+        cells = np.column_stack([np.floor(xyz / leaf_m).astype(np.int64), objects.astype(np.int64)])
+        return cls._summed(cells, xyz, np.ones(len(xyz), dtype=np.int64))
+
+    @classmethod
+    def joined(cls, parts: list[_Fused]) -> _Fused:
+        return cls._summed(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("cells", "sums", "n")))
+
+    @classmethod
+    def _summed(cls, cells: Int64Array, sums: FloatArray, n: Int64Array) -> _Fused:
+        if not len(cells):
+            return cls.nothing()
+        order = np.lexsort(cells.T)
+        cells = cells[order]
+        starts = np.flatnonzero(np.r_[True, np.any(cells[1:] != cells[:-1], axis=1)])
+        return cls(cells[starts], np.add.reduceat(sums[order], starts), np.add.reduceat(n[order], starts))
+
+    @property
+    def means(self) -> FloatArray:
+        return np.asarray(self.sums / self.n[:, None])
+
+    @property
+    def objects(self) -> UIntArray:
+        return self.cells[:, 3].astype(np.uint32)

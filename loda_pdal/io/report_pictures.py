@@ -18,7 +18,7 @@ from loda_pdal.model.labels import ChangeLabel
 from loda_pdal.model.pair import Pair
 from loda_pdal.model.records import UIntArray
 
-PICTURE_PX = 440
+PICTURE_PX = 400
 """Columns of a picture of one change."""
 MAP_PX = 1400
 """Longer edge of the map's backdrop."""
@@ -253,7 +253,7 @@ def _cut_line(cut_xy: FloatArray, view: View) -> str:
     ends = np.column_stack(
         [(cut_xy[:, 0] - view.u0) / view.pixel_m, (view.v0 + view.height_m - cut_xy[:, 1]) / view.pixel_m]
     )
-    box = shapely.box(14, 14, columns - 14, rows - 14)
+    box = shapely.box(14, 14, columns - 14, rows - 34)  # clear of the scale bar
     line = shapely.LineString(ends).intersection(box)
     if line.is_empty or line.geom_type != "LineString":
         return ""
@@ -332,9 +332,9 @@ def _map_shape(shape: Shape, view: View, font: float) -> str:
     kind = " ground" if shape.is_ground else " unchanged" if shape.label is ChangeLabel.UNCHANGED else ""
     drawn = f'<path class="shape{kind}" fill-rule="evenodd" d="{svg_path(footprint, view, digits=1)}"/>'
     x0, y0, x1, y1 = footprint.bounds
-    if max(x1 - x0, y1 - y0) / view.pixel_m < 1.2 * font and kind != " unchanged":  # too small to see: ring it
+    if max(x1 - x0, y1 - y0) / view.pixel_m < 0.7 * font and kind != " unchanged":  # too small to see: ring it
         x, y = ((x0 + x1) / 2 - view.u0) / view.pixel_m, (view.v0 + view.height_m - (y0 + y1) / 2) / view.pixel_m
-        drawn += f'<circle class="pin" cx="{x:.1f}" cy="{y:.1f}" r="{0.9 * font:.1f}"/>'
+        drawn += f'<circle class="pin" cx="{x:.1f}" cy="{y:.1f}" r="{0.55 * font:.1f}"/>'
     name = f' href="#{html.escape(shape.target)}"' if shape.target else ""
     return (
         f'<a{name} data-label="{shape.label.title}" style="--c:{LABEL_COLOURS[shape.label]}">'

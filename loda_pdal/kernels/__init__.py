@@ -1,14 +1,68 @@
 """Numba loops: no validation, no logging, no paths.
 
 Compiled kernels are cached in the user's cache folder, so that every process finds them again
-(``NUMBA_CACHE_DIR`` is respected where the user set it).
+(``NUMBA_CACHE_DIR`` is respected where the user set it). A folder that cannot be written is replaced by one of the
+user's own under the temporary folder.
 """
 
 from __future__ import annotations
 
 import os
+import stat
+import sys
+import tempfile
 from pathlib import Path
 
-if "NUMBA_CACHE_DIR" not in os.environ:
-    _cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "loda-pdal" / "numba"
-    os.environ["NUMBA_CACHE_DIR"] = str(_cache)
+
+def cache_folder() -> Path:
+    """Folder of the compiled kernels; it may not exist yet where the user named it."""
+    chosen = os.environ.get("NUMBA_CACHE_DIR") or getattr(_loaded_numba_config(), "CACHE_DIR", "")
+    return Path(chosen) if chosen else _writable_folder()
+
+
+def is_cache_warm() -> bool:
+    """Whether compiled kernels are there already; if not, the first run compiles them, which takes a minute."""
+    return any(cache_folder().rglob("*.nbi"))
+
+
+def _loaded_numba_config() -> object:
+    return getattr(sys.modules.get("numba"), "config", None)
+
+
+def _writable_folder() -> Path:
+    """The user's cache folder, else one under the temporary folder that only this user can write."""
+    try:
+        base = os.environ.get("XDG_CACHE_HOME")
+        folder = (Path(base) if base else Path.home() / ".cache") / "loda-pdal" / "numba"
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except (OSError, RuntimeError):  # read-only or full disk; no home at all
+        return _temporary_folder()
+
+
+def _temporary_folder() -> Path:
+    """A folder that is ours alone: cached kernels are code, nobody else may put files there."""
+    user = os.getuid() if hasattr(os, "getuid") else os.environ.get("USERNAME", "user")
+    folder = Path(tempfile.gettempdir()) / f"loda-pdal-{user}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+        is_ours = not hasattr(os, "getuid") or found.st_uid == os.getuid()
+        if stat.S_ISDIR(found.st_mode) and is_ours and (os.name == "nt" or not found.st_mode & 0o022):
+            return folder
+    except OSError:
+        pass
+    return Path(tempfile.mkdtemp(prefix="loda-pdal-"))
+
+
+def _use_cache_folder() -> None:
+    folder = str(cache_folder())
+    config = _loaded_numba_config()
+    if config is None:
+        os.environ["NUMBA_CACHE_DIR"] = folder
+    else:  # imported before us: it has read its environment, and would drop its other settings if that changed now
+        config.CACHE_DIR = folder  # type: ignore[attr-defined]
+
+
+_use_cache_folder()

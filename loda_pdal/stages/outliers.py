@@ -1,0 +1,56 @@
+"""Statistical outlier removal (paper, section 4.1)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from loda_pdal.kernels.neighbours import knn
+from loda_pdal.model.cloud import BoolArray, FloatArray, VoxelCloud
+from loda_pdal.params import OutlierParams
+
+
+def remove_outliers(cloud: VoxelCloud, params: OutlierParams) -> VoxelCloud:
+    """The voxels that are not statistical outliers; raw points of the others get voxel -1.
+
+    Parameters
+    ----------
+    cloud : VoxelCloud
+        One epoch, fused.
+    params : OutlierParams
+        Neighbours and threshold; nothing is removed where it is not enabled.
+    """
+    if not params.is_enabled or len(cloud) == 0:
+        return cloud
+    return cloud.subset(~find_outliers(cloud.xyz, params))
+
+
+def find_outliers(xyz: FloatArray, params: OutlierParams) -> BoolArray:
+    """Points whose mean distance to their k nearest neighbours exceeds mean + multiplier * standard deviation.
+
+    Parameters
+    ----------
+    xyz : (m, 3) float64, m
+    params : OutlierParams
+
+    Returns
+    -------
+    (m,) bool
+        Mean and (sample) standard deviation are exactly rounded sums over all points, whatever their order.
+    """
+    distance = mean_neighbour_distance(xyz, params.k)
+    n = len(distance)
+    if n < 2:
+        return np.zeros(n, dtype=np.bool_)
+    mean = math.fsum(distance) / n
+    deviation = math.sqrt(math.fsum((distance - mean) ** 2) / (n - 1))
+    return np.asarray(distance > mean + params.std_multiplier * deviation)
+
+
+def mean_neighbour_distance(xyz: FloatArray, k: int) -> FloatArray:
+    """Mean distance (m,) float64, m, to the k nearest other points, or to all others where there are fewer than k."""
+    k = min(k, len(xyz) - 1)
+    if k < 1:
+        return np.zeros(len(xyz))
+    return np.asarray(knn(xyz, k, includes_self=False).distance.mean(axis=1, dtype=np.float64))
