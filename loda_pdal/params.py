@@ -150,6 +150,9 @@ class IcpParams(StageParams):
     stop_update: float = param(1e-4, "stop when the pose changes less", unit="m, rad", low=1e-9, high=0.1)
     max_normal_angle_deg: float = param(30.0, "largest angle between paired normals", unit="deg", low=1, high=90)
     tukey_m: float = param(0.30, "residual at which a pair is rejected", unit="m", symbol="tau", low=0.01, high=10)
+    adapts_tukey: bool = param(
+        True, "tukey_m follows the residuals: less where surfaces fit well, more at first where they start apart"
+    )
     sigma0_m: float = param(0.02, "fixed sensor noise", unit="m", symbol="sigma_0", low=1e-4, high=1)
     loss: str = param("tukey", "robust loss, or least squares", choices=("tukey", "l2"))
     covariance: str = param(
@@ -686,7 +689,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
     "paper": {
         "name": "paper",
         "outliers": {"std_multiplier": 1.0},
-        "icp": {"covariance": "normal"},
+        "icp": {"covariance": "normal", "adapts_tukey": False},
         "ground": {"vertical": "ground"},
         "lod": {"pose_term": "translation", "small_sample": False, "drift_term": "none"},
         "association": {"boxes": "pca"},

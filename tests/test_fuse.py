@@ -17,7 +17,7 @@ PARAMS = FuseParams(leaf_m=0.25)
 
 def cloud(seed: int, n: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    return to_local_grid(rng.uniform(-1.5, 1.5, (n, 3)) + [100.0, -50.0, 0.0])
+    return to_local_grid(rng.uniform(-1.5, 1.5, (n, 3)) + np.array([100.0, -50.0, 0.0]))
 
 
 def test_by_hand() -> None:

@@ -22,7 +22,7 @@ def cloud(seed: int = 0, n: int = 400) -> np.ndarray:
     xyz[:80] = np.round(xyz[:80])
     xyz[80:90] = xyz[90:100]
     xyz[-1] = [300, -200, 60]
-    return xyz + [390_000.0, 6_460_000.0, 20.0]
+    return xyz + np.array([390_000.0, 6_460_000.0, 20.0])
 
 
 def sq_distances(xyz: np.ndarray, queries: np.ndarray) -> np.ndarray:
@@ -56,7 +56,7 @@ def test_knn_equals_brute_force(k: int, max_distance: float, includes_self: bool
 
 
 def test_knn_of_other_queries_equals_brute_force() -> None:
-    xyz, queries = cloud(), cloud(1, 150) + [3.0, 0.5, -0.2]
+    xyz, queries = cloud(), cloud(1, 150) + np.array([3.0, 0.5, -0.2])
     found = knn(xyz, 7, 4.0, queries)
     idx, _ = slow_knn(sq_distances(xyz, queries), 7, 4.0, False)
     assert np.array_equal(found.idx, idx)
@@ -92,7 +92,7 @@ def test_memory_follows_the_points_and_not_the_extent() -> None:
     cells = build_cells(xyz, 0.25)
     assert cells.row_start.size <= 2 * neighbours.MOST_CELLS_ALONG
     assert cells.column_y.size <= 4
-    assert nearest(xyz, xyz + [0.0, 0.2, 0], 1.0)[0].tolist() == [0, 1, 2, 3]
+    assert nearest(xyz, xyz + np.array([0.0, 0.2, 0]), 1.0)[0].tolist() == [0, 1, 2, 3]
 
 
 def test_empty_clouds_have_no_neighbours() -> None:

@@ -10,6 +10,8 @@ from loda_pdal.stages.normals import estimate_normals
 
 PARAMS = NormalParams()
 
+HERE = np.array([640.0, -310.0, 25.0])
+
 
 def plane(normal: np.ndarray, noise_m: float, seed: int = 0, n: int = 4000) -> np.ndarray:
     """A noisy 12 m square across ``normal``, at map-like coordinates."""
@@ -18,7 +20,7 @@ def plane(normal: np.ndarray, noise_m: float, seed: int = 0, n: int = 4000) -> n
     u /= np.linalg.norm(u)
     v = np.cross(normal, u)
     xyz = rng.uniform(-6, 6, (n, 1)) * u + rng.uniform(-6, 6, (n, 1)) * v + rng.normal(0, noise_m, (n, 1)) * normal
-    return xyz + [640.0, -310.0, 25.0]
+    return xyz + HERE
 
 
 @pytest.mark.parametrize("direction", [(0, 0, 1), (1, 0, 0), (0, -1, 0), (0.2, -0.3, 0.93), (0.6, 0.8, -0.1)])
@@ -34,7 +36,7 @@ def test_normal_and_roughness_of_a_known_plane(direction: tuple[float, float, fl
 
 def test_equals_a_slow_twin() -> None:
     rng = np.random.default_rng(1)
-    xyz = np.vstack([plane(np.array([0, 0.6, 0.8]), 0.03, n=1500), rng.uniform(-2, 2, (300, 3)) + [640.0, -310, 27]])
+    xyz = np.vstack([plane(np.array([0, 0.6, 0.8]), 0.03, n=1500), rng.uniform(-2, 2, (300, 3)) + HERE])
     found = estimate_normals(xyz, PARAMS)
     local = (xyz - xyz.mean(axis=0)).astype(np.float32).astype(float)
     for i in range(0, len(xyz), 7):
@@ -56,7 +58,7 @@ def test_equals_a_slow_twin() -> None:
 def test_wires_blobs_and_lone_points_are_no_planes() -> None:
     rng = np.random.default_rng(2)
     wire = np.column_stack([np.linspace(0, 20, 400), np.zeros(400), np.full(400, 8.0)])
-    blob = rng.normal(0, 0.4, (2000, 3)) + [0, 20, 0]
+    blob = rng.normal((0, 20, 0), 0.4, (2000, 3))
     lone = np.array([[50.0, 50, 50], [50.1, 50, 50]])
     found = estimate_normals(np.vstack([wire, blob, lone]), PARAMS)
     assert not found.is_valid[:400].any()

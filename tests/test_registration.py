@@ -79,7 +79,7 @@ def changed(items: list[Item], seed: int) -> list[Item]:
     return result
 
 
-def scan(items: list[Item], seed: int, noise_m: float = 0.02, density: float = 40.0) -> np.ndarray:
+def scan(items: list[Item], seed: int, noise_m: float = 0.02, density: float = 25.0) -> np.ndarray:
     """Points of undulating ground and of all items, (n, 3) m about the middle of the scene."""
     rng = np.random.default_rng(seed)
     ground = rectangle(rng, [-35, -20, 0], [70, 0, 0], [0, 40, 0], density)
@@ -96,7 +96,7 @@ def fused(points: np.ndarray) -> VoxelCloud:
 def two_epochs(seed: int) -> tuple[np.ndarray, np.ndarray]:
     """A street and the same street later, scanned by a noisier and sparser scanner, already registered."""
     items = houses_and_cars(seed)
-    later = scan(changed(items, seed + 1), seed + 2, noise_m=0.03, density=30.0)
+    later = scan(changed(items, seed + 1), seed + 2, noise_m=0.03, density=18.0)
     return scan(items, seed + 3) + HERE, later + HERE
 
 
@@ -165,7 +165,7 @@ def test_a_survey_against_itself_stays_where_it_is() -> None:
     assert np.array_equal(found.T_after_before, np.eye(4))
     assert found.rmse_m == 0
     assert found.overlap == 1
-    assert 0 < np.linalg.eigvalsh(found.covariance)[0]
+    assert np.linalg.eigvalsh(found.covariance)[0] > 0
     assert np.sqrt(np.diag(found.covariance)).max() < 0.002
 
 
@@ -205,17 +205,16 @@ def test_neither_threads_nor_a_shift_of_the_map_change_the_pose() -> None:
 
 
 def test_two_unrelated_streets_do_not_converge() -> None:
-    for seed in (0, 10):
-        found = registered(two_epochs(seed)[0], two_epochs(seed + 10)[1])
-        assert not found.converged
-        assert "partner" in found.message
+    found = registered(two_epochs(0)[0], two_epochs(10)[1])
+    assert not found.converged
+    assert "partner" in found.message
 
 
 def test_a_bare_field_is_not_held_sideways_and_is_not_moved_sideways() -> None:
     rng = np.random.default_rng(0)
     before, after = (rectangle(rng, [-30, -30, 0], [60, 0, 0], [0, 60, 0], 30) for _ in range(2))
     before, after = (field + rng.normal(0, 0.02, field.shape) + HERE for field in (before, after))
-    found = registered(before, after + [0, 0, 0.4])
+    found = registered(before, after + np.array([0, 0, 0.4]))
     assert not found.converged
     assert "slide" in found.message
     assert found.shift_m == pytest.approx([0, 0, 0.4], abs=0.02)
@@ -262,26 +261,24 @@ def test_distributions_by_hand() -> None:
     assert np.allclose(information, [[1 / (1 + 0.36), 0, 0, 1 / (0.25 + 0.36), 0, 1 / (0.0625 + 0.36)]])
 
 
-def test_tukey_is_not_drawn_by_what_changed_and_least_squares_is() -> None:
+def test_a_raised_road_does_not_draw_the_pose() -> None:
+    before, _ = two_epochs(0)
     rng = np.random.default_rng(3)
-    ground = rectangle(rng, [-20, -20, 0], [40, 0, 0], [0, 40, 0], 40)
-    walls = [
-        rectangle(rng, [-20, 20, 0], [40, 0, 0], [0, 0, 8], 40),
-        rectangle(rng, [20, -20, 0], [0, 40, 0], [0, 0, 8], 40),
-    ]
-    before = np.vstack([ground, *walls]) + rng.normal(0, 0.01, (len(ground) + sum(map(len, walls)), 3)) + HERE
     after = before + rng.normal(0, 0.01, before.shape)
-    after[(before[:, 0] < HERE[0] - 8) & (before[:, 2] < HERE[2] + 0.1)] += [0, 0, 0.2]  # fresh asphalt
-    shift = {}
-    for loss in ("tukey", "l2"):
-        parameters = replace(PARAMETERS, icp=IcpParams(loss=loss), ndt=NdtParams(is_enabled=False))
-        shift[loss] = np.abs(registered(before, after, parameters).shift_m).max()
-    assert shift["tukey"] < 0.4 * shift["l2"]
+    is_raised = (before[:, 0] < HERE[0] - 20) & (before[:, 2] < HERE[2] + 0.5)  # fresh asphalt at one end
+    after[is_raised, 2] += 0.2
+    unchanged = before[~is_raised]
+    error = {}
+    for name, params in {"ours": IcpParams(), "l2": IcpParams(loss="l2")}.items():
+        found = registered(before, after, replace(PARAMETERS, icp=params))
+        error[name] = np.abs(transform_points(found.T_after_before, unchanged) - unchanged).max()
+    assert error["ours"] < 0.005
+    assert error["l2"] > 0.05
 
 
 def test_normal_equations_equal_their_definition() -> None:
-    before, after = (fused(points).xyz[::6] for points in two_epochs(0))
-    params, normal_params = IcpParams(), NormalParams(radius_m=1.5)
+    before, after = (fused(points).xyz[::12] for points in two_epochs(0))
+    params, normal_params = IcpParams(), NormalParams(radius_m=2.0)
     centre = after.mean(axis=0)
     source, target = icp._Surface.of(before, normal_params), icp._Surface.of(after, normal_params)
     level = icp._Level.of(source, target, centre, 0.75, params, normal_params)
@@ -320,23 +317,27 @@ def patchy_noise(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return points + rng.normal(0, 0.02, (41, 41, 3))[patch[:, 0], patch[:, 1]]
 
 
-@pytest.mark.parametrize("noise", [independent_noise, patchy_noise])
-def test_block_covariance_covers_the_errors(noise: Callable[[np.ndarray, np.random.Generator], np.ndarray]) -> None:
-    items = houses_and_cars(5)
-    ratios: dict[str, list[np.ndarray]] = {"block": [], "normal": []}
-    for trial in range(8):
+def errors_over_sigma(kind: str, noise: Callable[[np.ndarray, np.random.Generator], np.ndarray], n: int) -> float:
+    """Root mean square of the errors of ``n`` poses, all six components, each over its standard deviation."""
+    items, ratios = houses_and_cars(5), []
+    for trial in range(n):
         rng = np.random.default_rng(trial)
-        before, after = (noise(scan(items, 100 + 2 * trial + e, density=20.0), rng) + HERE for e in (0, 1))
-        for kind, found in ratios.items():
-            pose = fine_pose(fused(before).xyz, fused(after).xyz, np.eye(4), IcpParams(covariance=kind), NormalParams())
-            T = pose.T_target_source
-            R = T[:3, :3]
-            shift = R @ pose.centre + T[:3, 3] - pose.centre
-            turn = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-            assert np.array_equal(pose.covariance, pose.covariance.T)
-            assert np.linalg.eigvalsh(pose.covariance)[0] > 0
-            found.append(np.concatenate([shift, turn]) / np.sqrt(np.diag(pose.covariance)))
-    rms = {kind: float(np.sqrt(np.mean(np.square(values)))) for kind, values in ratios.items()}
-    assert 0.4 < rms["block"] < 1.6
-    if noise is patchy_noise:
-        assert rms["normal"] > 5  # the closed form takes a patch for hundreds of independent points
+        before, after = (fused(noise(scan(items, 100 + 2 * trial + e, density=12.0), rng) + HERE).xyz for e in (0, 1))
+        pose = fine_pose(before, after, np.eye(4), IcpParams(covariance=kind), NormalParams())
+        assert np.array_equal(pose.covariance, pose.covariance.T)
+        assert np.linalg.eigvalsh(pose.covariance)[0] > 0
+        R, t = pose.T_target_source[:3, :3], pose.T_target_source[:3, 3]
+        turn = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+        twist = np.concatenate([R @ pose.centre + t - pose.centre, turn])
+        ratios.append(twist / np.sqrt(np.diag(pose.covariance)))
+    return float(np.sqrt(np.mean(np.square(ratios))))
+
+
+def test_block_covariance_covers_the_errors() -> None:
+    assert 0.4 < errors_over_sigma("block", independent_noise, 5) < 1.6
+    assert 0.4 < errors_over_sigma("block", patchy_noise, 5) < 1.6
+
+
+def test_the_closed_form_takes_a_patch_for_hundreds_of_independent_points() -> None:
+    assert errors_over_sigma("normal", independent_noise, 3) < 2
+    assert errors_over_sigma("normal", patchy_noise, 3) > 5

@@ -1,7 +1,9 @@
 """Confidence that means what it says: fit the calibration of a preset on simulated training blocks (METHOD 3).
 
-A label is right when most points of its object carry it in the truth. The share of right labels is fitted as a
-logistic function of the raw score, for three kinds of labels; validation blocks then tell how far it is off.
+A label is right when most points of its object belong to instances with that label; Increased and Decreased are right
+as well where the surface that changed within the object changed that way (a part of a house, METHOD 2b). The share of
+right labels is fitted as a logistic function of the raw score, for three kinds of labels; validation blocks then tell
+how far it is off.
 """
 
 from __future__ import annotations
@@ -35,7 +37,10 @@ KINDS = {
 """The parameter of `ConfidenceParams` that calibrates each label."""
 
 MIN_SHARE = 0.5
-"""An object counts as right where at least this share of its points has its label in the truth."""
+"""Share of an object's points that must belong to instances with its label."""
+
+MIN_CHANGED_SHARE = 0.1
+"""Share of an object's points that must lie on surface that changed as its label says."""
 
 _PRIOR = 1.0
 """Weight of the prior that keeps the slope finite where all labels are right, in objects."""
@@ -92,15 +97,22 @@ def surveys_of(block: SimulatedBlock) -> Pair[Survey]:
 def judged_objects(seed: int, block: SimulatedBlock, result: ChangeResult) -> list[Judged]:
     """Whether each labelled object of a result is right."""
     n = max((o.object_id for o in result.objects), default=0) + 1
-    votes = np.zeros((n, len(ChangeLabel)), dtype=np.int64)
+    of_instance = np.full(max(i.instance_id for i in block.truth.instances) + 1, ChangeLabel.UNCHANGED, dtype=np.uint8)
+    for instance in block.truth.instances:
+        of_instance[instance.instance_id] = instance.label
+    by_instance, by_surface = np.zeros((n, len(ChangeLabel))), np.zeros((n, len(ChangeLabel)))
     for survey, points in zip(block.surveys, result.points, strict=True):
-        np.add.at(votes, (points.object, survey.truth_change), 1)
+        np.add.at(by_instance, (points.object, of_instance[survey.truth_id]), 1)
+        np.add.at(by_surface, (points.object, survey.truth_change), 1)
     judged = []
     for record in result.objects:
         if record.confidence is None or record.confidence_raw is None:
             continue
-        own = votes[record.object_id]
-        is_right = bool(own[record.label] >= MIN_SHARE * own.sum())
+        instance_votes, surface_votes = by_instance[record.object_id], by_surface[record.object_id]
+        is_right = bool(instance_votes[record.label] >= MIN_SHARE * instance_votes.sum())
+        if record.label in (ChangeLabel.INCREASED, ChangeLabel.DECREASED):
+            share = surface_votes[record.label] / max(surface_votes.sum(), 1)
+            is_right |= bool(share >= MIN_CHANGED_SHARE and surface_votes[record.label] == surface_votes[2:].max())
         judged.append(Judged(seed, KINDS[record.label], record.confidence_raw, record.confidence, is_right))
     return judged
 

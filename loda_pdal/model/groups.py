@@ -102,7 +102,7 @@ def consecutive(labels: npt.NDArray[Any]) -> tuple[npt.NDArray[np.int32], int]:
 
 
 def count_cells(points: FloatArray, labels: npt.NDArray[Any], n: int, cell_m: float) -> FloatArray:
-    """How many cells of ``cell_m`` the points (m, d) of each label occupy, (n,) float64; negative labels do not count."""
+    """Cells of ``cell_m`` that the points (m, d) of each label occupy, (n,) float64; negative labels do not count."""
     is_member = labels >= 0
     cells = np.floor(points[is_member] / cell_m).astype(np.int64)
     rows = unique_rows(np.column_stack([labels[is_member].astype(np.int64), cells]))

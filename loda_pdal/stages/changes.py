@@ -327,8 +327,8 @@ def _renumbered(surfaces: Pair[Surface], parent: IntArray) -> tuple[Pair[Surface
     for side in owner:
         is_used[side[side >= 0]] = True
     order = np.argsort(rank)
-    order = order[is_used[order]].astype(np.int32)
+    kept: IntArray = order[is_used[order]].astype(np.int32)
     number = np.full(n + 1, -1, dtype=np.int32)
-    number[order] = np.arange(len(order), dtype=np.int32)
+    number[kept] = np.arange(len(kept), dtype=np.int32)
     surfaces = surfaces.join(owner.map(lambda side: number[side]), Surface.owned_by)
-    return surfaces, order, number[parent[order]]
+    return surfaces, kept, np.asarray(number[parent[kept]], dtype=np.int32)

@@ -249,7 +249,7 @@ def weigh(
     )
     summit = columns.map(lambda side: Groups(side.column[:, 0], n).quantile(side.top, 0.95))
     top = height if params.height_reference == "ground" else summit
-    middle = (cells.cell + 0.5) * params.voxel_m
+    middle = np.asarray((cells.cell + 0.5) * params.voxel_m, dtype=np.float64)
     centroid = own.join(is_known, lambda side, known: Groups(np.where(known, side, -1), n).mean(middle))
     return Evidence(
         n_points=points.join(surfaces, lambda group, surface: group.sum(surface.n_raw)),
@@ -302,7 +302,7 @@ def _owned_cells(surface: Surface, voxel_m: float) -> _Occupied:
     """Voxels that an epoch's objects occupy; the lowest object where several meet."""
     is_member = surface.owner >= 0
     rows = np.column_stack([cells_of(surface.xyz[is_member], voxel_m), surface.owner[is_member]])
-    points = np.bincount(unique_inverse(rows), weights=surface.n_raw[is_member])
+    points = np.asarray(np.bincount(unique_inverse(rows), weights=surface.n_raw[is_member]), dtype=np.float64)
     rows = unique_rows(rows)
     is_first = np.ones(len(rows), np.bool_)
     is_first[1:] = np.any(rows[1:, :3] != rows[:-1, :3], axis=1)

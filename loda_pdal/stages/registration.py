@@ -15,7 +15,7 @@ from loda_pdal.model.registration import Registration
 from loda_pdal.model.transform import IDENTITY, invert, transform_points
 from loda_pdal.params import Parameters
 from loda_pdal.stages.fuse import downsample
-from loda_pdal.stages.icp import fine_pose
+from loda_pdal.stages.icp import FinePose, fine_pose
 from loda_pdal.stages.ndt import coarse_pose
 
 MISFIT_LEAF_M = 1.0
@@ -24,8 +24,9 @@ MISFIT_LEAF_M = 1.0
 MISFIT_LIMIT_M = 2.0
 """Points farther than this from the other cloud count as this far: they have no partner in any pose."""
 
-MIN_GAIN = 0.02
-"""A pose replaces a simpler one only where it lowers the misfit by this share."""
+MIN_GAIN = 0.05
+"""A pose replaces a simpler one only where it lowers the misfit by this share; sliding along a surface changes it by
+up to half of that, as the voxel grids come and go into step."""
 
 
 def register(clouds: Pair[VoxelCloud], parameters: Parameters) -> Registration:
@@ -48,15 +49,12 @@ def register(clouds: Pair[VoxelCloud], parameters: Parameters) -> Registration:
     source, target = (
         (clouds.before.xyz, clouds.after.xyz) if reference == "after" else (clouds.after.xyz, clouds.before.xyz)
     )
-    first = IDENTITY.copy()
-    if parameters.ndt.is_enabled:
-        first = better_pose(source, target, first, coarse_pose(source, target, parameters.ndt).T_target_source)
-    pose = fine_pose(source, target, first, parameters.icp, parameters.normals)
+    pose = _find_pose(source, target, parameters)
     T = pose.T_target_source
     if not pose.converged:
         T = better_pose(source, target, IDENTITY.copy(), T)
     return Registration(
-        T_after_before=T if reference == "after" else invert(T),
+        T_after_before=invert(invert(T)) if reference == "after" else invert(T),  # so that a swap rounds alike
         reference=reference,
         covariance=pose.covariance,
         centre=pose.centre,
@@ -67,6 +65,21 @@ def register(clouds: Pair[VoxelCloud], parameters: Parameters) -> Registration:
         overlap=pose.overlap,
         message=pose.message,
     )
+
+
+def _find_pose(source_xyz: FloatArray, target_xyz: FloatArray, parameters: Parameters) -> FinePose:
+    """ICP from the first pose; where that fails, ICP from where the clouds are, unless that is clearly worse."""
+    start = IDENTITY.copy()
+    first = start
+    if parameters.ndt.is_enabled:
+        coarse = coarse_pose(source_xyz, target_xyz, parameters.ndt)
+        first = better_pose(source_xyz, target_xyz, start, coarse.T_target_source)
+    pose = fine_pose(source_xyz, target_xyz, first, parameters.icp, parameters.normals)
+    if pose.converged or first is start:
+        return pose
+    alone = fine_pose(source_xyz, target_xyz, start, parameters.icp, parameters.normals)
+    T = better_pose(source_xyz, target_xyz, alone.T_target_source, pose.T_target_source)
+    return alone if alone.converged or T is alone.T_target_source else pose
 
 
 def choose_reference(clouds: Pair[VoxelCloud]) -> str:
