@@ -332,11 +332,11 @@ def assemble(
         block=outline_of(in_after),
         parameters=p,
         has_ground=has_ground,
-        warnings=warnings_of(registration, has_ground, changes),
+        warnings=warnings_of(registration, has_ground, changes, ground_change),
     )
 
 
-def warnings_of(registration: Registration, has_ground: bool, changes: Changes) -> list[str]:
+def warnings_of(registration: Registration, has_ground: bool, changes: Changes, ground: GroundChanges) -> list[str]:
     """What a user must know before trusting the result."""
     found = []
     if not registration.converged:
@@ -353,8 +353,16 @@ def warnings_of(registration: Registration, has_ground: bool, changes: Changes) 
         found.append(
             "No ground was found: heights are above the lowest returns nearby, and ground changes were not evaluated."
         )
+    measured = ground.dz[np.isfinite(ground.dz)]
+    low, middle, high = np.percentile(measured, (25, 50, 75)) if len(measured) >= _MIN_TILES else (0.0, 0.0, 0.0)
+    if max(abs(middle), high - low) > _GROUND_OFFSET_M:
+        found.append(
+            f"After registration the ground of the after survey lies {middle:+.2f} m from that of the before survey "
+            f"(median of {len(measured)} tiles; half of them between {low:+.2f} and {high:+.2f} m): check the vertical "
+            "datums and the calibration of the strips before believing small height changes."
+        )
     unseen = np.count_nonzero(changes.label == ChangeLabel.UNDETERMINED)
-    if len(changes) and unseen > 0.2 * len(changes):
+    if len(changes) and unseen > _MOST_UNSEEN * len(changes):
         found.append(
             f"{unseen} of {len(changes)} objects are Undetermined: the other survey could not have seen enough of them."
         )
@@ -363,6 +371,9 @@ def warnings_of(registration: Registration, has_ground: bool, changes: Changes) 
 
 _DATUM_SHIFT_M = 0.10
 _PLAN_SHIFT_M = 0.50
+_GROUND_OFFSET_M = 0.10
+_MIN_TILES = 50
+_MOST_UNSEEN = 0.2
 
 
 def _outline_m(p: Parameters) -> float:
