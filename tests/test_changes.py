@@ -99,7 +99,7 @@ def test_a_house_is_labelled_by_what_was_done_to_it(
 def test_the_storey_is_measured() -> None:
     found = decide(surface((0, HOUSE)), surface((0, block(0, 0, 10, 8, 9))), ObjectClass.BUILDING)
     assert found.evidence.dh[0] == pytest.approx(3.0, abs=0.01)
-    assert "dh +3.00 m" in found.reason[0]
+    assert "top +3.00 m" in found.reason[0]
     assert "LoD95 0.05 m" in found.reason[0]
 
 

@@ -219,7 +219,9 @@ def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: Ob
             f"(at least {observability.min_observability:.0%} needed)",
         )
     if is_apart:
-        return Verdict(label, f"something else stands in its place in the {other} survey")
+        return Verdict(
+            label, f"what the {other} survey shows there is another object; it shares {support:.0%} of the surface"
+        )
     if support >= params.min_support:
         return Verdict(
             ChangeLabel.UNCHANGED,
@@ -234,15 +236,15 @@ def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: Ob
 
 def _mobile(cue: Cue, params: ChangeParams) -> Verdict:
     """Matched mobile objects (paper, section 4.3): the same in its place, or the epoch with more of its own space."""
-    figures = f"IoU {cue.iou:.2f}, shift {cue.shift:.2f} m"
+    figures = f"overlap {cue.iou:.2f}, centre moved {cue.shift:.2f} m"
     if cue.iou > params.mobile_iou and cue.shift < params.mobile_shift_m:
         return Verdict(
-            ChangeLabel.UNCHANGED, f"{figures}: within IoU > {params.mobile_iou} and shift < {params.mobile_shift_m} m"
+            ChangeLabel.UNCHANGED, f"in its place: {figures} (limits {params.mobile_iou} and {params.mobile_shift_m} m)"
         )
     if cue.gained == cue.lost:
-        return Verdict(ChangeLabel.UNCHANGED, f"{figures}, but neither survey shows more of its own")
+        return Verdict(ChangeLabel.UNCHANGED, f"neither survey shows more of its own: {figures}")
     label, other = (ChangeLabel.ADDED, "after") if cue.gained > cue.lost else (ChangeLabel.REMOVED, "before")
-    return Verdict(label, f"{figures}: not the same object; the {other} survey occupies more space of its own")
+    return Verdict(label, f"not the same object; the {other} survey shows more of its own: {figures}")
 
 
 def _pair(cue: Cue, params: ChangeParams) -> Verdict:
@@ -264,22 +266,22 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
     figures = _figures(cue, height_m, ratio, gate)
     if (rises or swells) and (sinks or shrinks):
         if math.isnan(cue.rise) or cue.rise == 0:
-            return Verdict(ChangeLabel.UNCHANGED, f"height and volume disagree, occupancy does not move ({figures})")
+            return Verdict(
+                ChangeLabel.UNCHANGED, f"height and volume disagree, and the occupied space does not move: {figures}"
+            )
         label = ChangeLabel.INCREASED if cue.rise > 0 else ChangeLabel.DECREASED
-        return Verdict(
-            label, f"height and volume disagree; occupancy moves {cue.rise:+.2f} m in the overlap ({figures})"
-        )
+        return Verdict(label, f"height and volume disagree, but the occupied space moves {cue.rise:+.2f} m: {figures}")
     if rises or swells:
-        return Verdict(ChangeLabel.INCREASED, f"{_named(rises, swells)} up ({figures})")
+        return Verdict(ChangeLabel.INCREASED, f"{_named(rises, swells)} up: {figures}")
     if sinks or shrinks:
-        return Verdict(ChangeLabel.DECREASED, f"{_named(sinks, shrinks)} down ({figures})")
+        return Verdict(ChangeLabel.DECREASED, f"{_named(sinks, shrinks)} down: {figures}")
     limit = max(gate, params.displacement_m)
     if params.use_displacement and params.displacement_m > 0 and not is_green and abs(cue.d_perp) > limit:
         label = ChangeLabel.INCREASED if cue.gained >= cue.lost else ChangeLabel.DECREASED
         return Verdict(
-            label, f"surface moved {abs(cue.d_perp):.2f} m along its normal, more than {limit:.2f} m ({figures})"
+            label, f"surface moved {abs(cue.d_perp):.2f} m along its normal (limit {limit:.2f} m): {figures}"
         )
-    return Verdict(ChangeLabel.UNCHANGED, f"no cue above its limit ({figures})")
+    return Verdict(ChangeLabel.UNCHANGED, f"no cue above its limit: {figures}")
 
 
 def _named(is_height: bool, is_volume: bool) -> str:
@@ -289,12 +291,12 @@ def _named(is_height: bool, is_volume: bool) -> str:
 def _figures(cue: Cue, height_m: float, ratio: float, gate: float) -> str:
     parts = []
     if not math.isnan(cue.dh):
-        parts.append(f"dh {cue.dh:+.2f} m of {max(height_m, gate):.2f}")
+        parts.append(f"top {cue.dh:+.2f} m (limit {max(height_m, gate):.2f} m)")
     if not math.isnan(cue.dv_ratio):
-        parts.append(f"dV {cue.dv_ratio:+.0%} of {ratio:.0%}")
+        parts.append(f"volume {cue.dv_ratio:+.0%} (limit {ratio:.0%})")
     if not math.isnan(cue.lod95):
         parts.append(f"LoD95 {cue.lod95:.2f} m")
-    return ", ".join([*parts, f"IoU {cue.iou:.2f}"])
+    return ", ".join([*parts, f"overlap {cue.iou:.2f}"])
 
 
 def _raw(cue: Cue, verdict: Verdict, is_apart: bool, params: ChangeParams, confidence: ConfidenceParams) -> float:

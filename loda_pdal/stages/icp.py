@@ -385,10 +385,11 @@ def _paired_share(level: _Level, pairs: _Pairs, T: FloatArray) -> float:
     """Share of the jointly covered source surfaces that are paired, in the worst direction (0 to 1).
 
     The ground of any two streets can be paired; whether the walls can is what tells one place from another. So the
-    share is taken of the sums of n n' and not of the points.
+    share is taken of the sums of n n' / sigma^2 and not of the points; rough surfaces (crowns) count for little.
     """
     p = transform_points(T, level.source_xyz.astype(np.float64))
     n = rotate(T, level.source.normals.astype(np.float64))
+    n /= np.sqrt(level.sq_sigma0 + level.source.roughness.astype(np.float64) ** 2)[:, None]
     is_joint = is_covered(p, level.target_xyz.astype(np.float64), COVERED_M)
     is_pair = is_joint & (pairs.weight > 0)
     of_all, of_pairs = n[is_joint].T @ n[is_joint], n[is_pair].T @ n[is_pair]
