@@ -19,6 +19,9 @@ MAX_CENTROID_OFFSET_M = 0.5
 SPLITS = (("train", 0.60), ("validation", 0.70), ("test", 1.00))
 """Splits with the upper end of their share of the hash range: 60, 10 and 30 %."""
 
+SEEN = frozenset(f"seed {n}" for n in (1, 2, 3, 4, 5, 6, 7, 8, 12, 14, 15, 16, 21, 31, 32, 101, 102, 103))
+"""Blocks that were looked at during development: never test, whatever their hash."""
+
 
 def block_of(xy: FloatArray) -> Int64Array:
     """Index (ix, iy) of the block that each place belongs to, (n, 2); ``xy`` (n, 2) in map metres. Blocks are
@@ -32,7 +35,12 @@ def split_of_block(ix: int, iy: int) -> str:
 
 
 def split_of_name(name: str) -> str:
-    """Split of anything that has a name (a simulated block: ``seed 7``)."""
+    """Split of anything that has a name (a simulated block: ``seed 7``).
+
+    Blocks that were looked at while the method was made belong to training, wherever the hash would put them.
+    """
+    if name in SEEN:
+        return "train"
     digest = hashlib.sha256(name.encode("utf-8")).digest()
     share = int.from_bytes(digest[:8], "big") / 2.0**64
     return next(split for split, end in SPLITS if share < end or end == 1.0)
