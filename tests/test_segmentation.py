@@ -104,8 +104,20 @@ def test_the_ground_is_no_instance(scene: Scene) -> None:
 def test_clusters_are_linked_chains() -> None:
     line = np.column_stack([[0.0, 0.5, 1.0, 3.0, 3.4], np.zeros(5), np.zeros(5)])
     assert euclidean_clusters(line, 0.6).tolist() == [0, 0, 0, 1, 1]
-    reach = np.array([0.6, 0.6, 0.6, 0.6, 0.3])
-    assert euclidean_clusters(line, 0.6, reach).tolist() == [0, 0, 0, 1, 2]
+    reach = np.array([0.6, 0.6, 2.1, 2.1, 0.6])
+    assert euclidean_clusters(line, 0.6, reach).tolist() == [0, 0, 0, 0, 0]
+    assert euclidean_clusters(line, 0.45, np.array([0.45, 0.45, 2.1, 0.45, 0.45])).tolist() == [0, 1, 2, 3, 3]
+
+
+def test_clusters_agree_with_all_pairs() -> None:
+    rng = np.random.default_rng(6)
+    xyz = rng.uniform(0, 8, (400, 3))
+    reach = np.where(rng.random(400) < 0.2, rng.uniform(0.7, 1.5, 400), 0.7)
+    gap = np.linalg.norm(xyz[:, None] - xyz[None], axis=2)
+    links = np.argwhere(gap <= np.minimum(reach[:, None], reach[None]))
+    expected = merge(links, 400)
+    found = euclidean_clusters(xyz, 0.7, reach)
+    assert len(set(zip(expected.tolist(), found.tolist(), strict=True))) == expected.max() + 1 == found.max() + 1
 
 
 def test_dbscan_counts_weights_and_gives_border_points_to_the_nearest_core() -> None:

@@ -220,6 +220,15 @@ def radius_neighbours(xyz: npt.NDArray[Any], radius: float, queries: npt.NDArray
     return NeighbourLists(starts, idx)
 
 
+def count_neighbours(xyz: npt.NDArray[Any], radius: float) -> Int64Array:
+    """How many points of a cloud (n, 3) lie within ``radius``, m, of each of its points, itself included, (n,)."""
+    cells = build_cells(xyz, radius)
+    counts = np.zeros(len(xyz), dtype=np.int64)
+    if len(cells.xyz):
+        run_ranges(_count_range, len(xyz), cells, to_cell_frame(cells, xyz), float(radius), counts)
+    return counts
+
+
 def _cell_for(xyz: npt.NDArray[Any], k: int) -> float:
     """Column edge (m) that leaves a few points to each occupied column: a matter of speed only."""
     if len(xyz) == 0:

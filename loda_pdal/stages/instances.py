@@ -9,7 +9,8 @@ from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from loda_pdal.kernels.neighbours import nearest, radius_neighbours
+from loda_pdal.kernels.clusters import linked
+from loda_pdal.kernels.neighbours import count_neighbours, nearest, radius_neighbours
 from loda_pdal.model.boxes import upright_boxes
 from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, Int64Array, IntArray
 from loda_pdal.model.groups import Groups, consecutive
@@ -101,17 +102,11 @@ def form_instances(
 
 
 def euclidean_clusters(xyz: FloatArray, radius_m: float, reach_m: FloatArray | None = None) -> IntArray:
-    """Clusters (m,) of points linked where they lie within ``radius_m``, or within both points' own ``reach_m``."""
-    starts, neighbour = radius_neighbours(xyz, radius_m)
-    source = np.repeat(np.arange(len(xyz)), np.diff(starts))
-    is_edge = source < neighbour
-    source, target = source[is_edge], neighbour[is_edge]
-    if reach_m is not None:
-        distance = np.linalg.norm(xyz[source] - xyz[target], axis=1)
-        is_edge = distance <= np.minimum(reach_m[source], reach_m[target])
-        source, target = source[is_edge], target[is_edge]
-    graph = coo_array((np.ones(len(source), np.int8), (source, target)), shape=(len(xyz), len(xyz)))
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int32)
+    """Clusters (m,) of points linked within ``radius_m``, or within both points' own ``reach_m`` where that is more.
+
+    Numbered from 0 in the order of their first point.
+    """
+    return consecutive(linked(xyz, radius_m, reach_m))[0]
 
 
 def _buildings_by_contact(
@@ -290,10 +285,9 @@ def _vegetation(
         return label
     points = xyz[members]
     if params.is_density_adaptive:
-        starts, _ = radius_neighbours(points, 1.0)
-        density = np.diff(starts) / (4.0 / 3.0 * np.pi)
+        density = count_neighbours(points, 1.0) / (4.0 / 3.0 * np.pi)
         reach = np.maximum(params.cluster_radius_m, params.cluster_density_factor / np.cbrt(density))
-        cluster = euclidean_clusters(points, float(reach.max()), reach)
+        cluster = euclidean_clusters(points, params.cluster_radius_m, reach)
     else:
         cluster = euclidean_clusters(points, params.cluster_radius_m)
     if params.splits_crowns:
