@@ -15,6 +15,7 @@ from loda_pdal.model.labels import ChangeLabel
 from loda_pdal.model.records import ChangeResult, PointLabels
 from loda_pdal.model.survey import Survey
 from loda_pdal.model.transform import invert, transform_points
+from loda_pdal.params import Parameters
 from loda_pdal.pipeline import detect_changes
 
 SMALL = SimulationOptions(length_m=60.0, density=0.6)
@@ -113,6 +114,36 @@ def test_swapping_the_epochs_swaps_the_labels(block: SimulatedBlock, result: Cha
         assert np.array_equal(there_points.object, back_points.object)
     both = swapped.registration.T_after_before @ result.registration.T_after_before
     assert both == pytest.approx(np.eye(4), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "choice",
+    [
+        "superpoints.method=components",
+        "association.solver=greedy",
+        "association.boxes=pca",
+        "ground.vertical=ground",
+        "icp.loss=l2",
+        "instances.join_by_footprint=false",
+        "changes.visible_only=false",
+    ],
+)
+def test_every_choice_obeys_the_swap(choice: str) -> None:
+    scene = simulate_block(12, replace(SMALL, density=0.3))
+    before, after = (survey(side.xyz) for side in scene.surveys)
+    parameters = Parameters().with_setting(choice)
+    there, back = detect_changes(before, after, parameters), detect_changes(after, before, parameters)
+    assert [o.label for o in back.objects] == [o.label.swapped for o in there.objects]
+    assert len(there.changes) >= 5
+
+
+@pytest.mark.parametrize("preset", ["paper", "aerial"])
+def test_other_presets_show_no_change_in_a_survey_against_itself(block: SimulatedBlock, preset: str) -> None:
+    itself = survey(block.surveys.after.xyz)
+    found = detect_changes(itself, itself, Parameters.preset(preset))
+    assert len(found.objects) > 20
+    assert found.changes == []
+    assert found.ground_changes == []
 
 
 def test_point_order_and_threads_do_not_matter(block: SimulatedBlock, result: ChangeResult) -> None:

@@ -7,21 +7,21 @@ all. What is unmatched is Added or Removed only if its place was seen, and its s
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from loda_pdal.model.cloud import ByteArray, FloatArray, IntArray
+from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, IntArray
 from loda_pdal.model.labels import ChangeLabel, ObjectClass
 from loda_pdal.model.lod_grid import LodGrid
 from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams, ConfidenceParams, ObservabilityParams
 from loda_pdal.stages.confidence import calibrated, raw_confidence
 from loda_pdal.stages.correspondence import rank_by_place
-from loda_pdal.stages.cues import Evidence, Surface, sample_cells, weigh
+from loda_pdal.stages.cues import Evidence, Surface, holders, sample_cells, weigh
 from loda_pdal.stages.observability import Coverage
-from loda_pdal.stages.parts import dissolve, split_parts
+from loda_pdal.stages.parts import Parts, dissolve, split_parts
 
 
 @dataclass(frozen=True)
@@ -79,31 +79,20 @@ def decide_changes(
     lod : LodGrid
         Limits of detection.
     """
-    n = len(object_class)
     seen = coverage if observability.is_enabled or params.visible_only else None
-
-    cells = sample_cells(surfaces, seen, lod, params)
-    evidence = weigh(cells, surfaces, seen, n, params)
-    is_no_pair = np.array([_is_no_pair(cue, params) for cue in _rows(evidence, object_class)], dtype=np.bool_)
-    is_apart = np.zeros(n, np.bool_)
+    n = len(object_class)
+    cast = _Cast(surfaces, object_class, np.full(n, -1, dtype=np.int32), np.zeros(n, np.bool_)).settled(params.voxel_m)
+    cells = sample_cells(cast.surfaces, seen, lod, params)
+    evidence = weigh(cells, cast.surfaces, seen, len(cast), params)
+    is_no_pair = np.array([_is_no_pair(cue, params) for cue in _rows(evidence, cast.object_class)], dtype=np.bool_)
     if is_no_pair.any():
-        owner, partner = dissolve(surfaces.map(lambda side: side.owner), is_no_pair, n)
-        object_class = np.concatenate([object_class, object_class[partner]])
-        is_apart = np.concatenate([is_no_pair, np.ones(len(partner), np.bool_)])
-        surfaces = surfaces.join(owner, Surface.owned_by)
-        cells = sample_cells(surfaces, seen, lod, params)
-    parent = np.full(len(object_class), -1, dtype=np.int32)
+        cast = cast.without_pairs(is_no_pair).settled(params.voxel_m)
+        cells = sample_cells(cast.surfaces, seen, lod, params)
     if params.find_parts:
-        parts = split_parts(cells, surfaces, len(object_class), params)
-        parent = parts.parent
-        whole = np.where(parent >= 0, parent, np.arange(len(parent)))
-        object_class, is_apart = object_class[whole], is_apart[whole]
-        surfaces = surfaces.join(parts.owner, Surface.owned_by)
-    surfaces, order, parent = _renumbered(surfaces, parent)
-    object_class, is_apart = object_class[order], is_apart[order]
-
-    cells = sample_cells(surfaces, seen, lod, params)
-    evidence = weigh(cells, surfaces, seen, len(object_class), params)
+        cast = cast.with_parts(split_parts(cells, cast.surfaces, len(cast), params)).settled(params.voxel_m)
+        cells = sample_cells(cast.surfaces, seen, lod, params)
+    evidence = weigh(cells, cast.surfaces, seen, len(cast), params)
+    surfaces, object_class, parent, is_apart = cast.surfaces, cast.object_class, cast.parent, cast.is_apart
     cues = _rows(evidence, object_class)
     verdicts = [_verdict(cue, apart, params, observability) for cue, apart in zip(cues, is_apart.tolist(), strict=True)]
     raw = np.array(
@@ -125,6 +114,73 @@ def decide_changes(
         reason=tuple(v.reason for v in verdicts),
         evidence=evidence,
     )
+
+
+@dataclass(frozen=True)
+class _Cast:
+    """The objects as they stand: who owns which point, of which class, part of whom, and whether a pair was undone."""
+
+    surfaces: Pair[Surface]
+    object_class: ByteArray
+    parent: IntArray
+    is_apart: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.object_class)
+
+    def without_pairs(self, is_no_pair: BoolArray) -> _Cast:
+        """The before and the after side of the marked objects as objects of their own."""
+        owner, partner = dissolve(self.surfaces.map(lambda side: side.owner), is_no_pair, len(self))
+        return _Cast(
+            self.surfaces.join(owner, Surface.owned_by),
+            np.concatenate([self.object_class, self.object_class[partner]]),
+            np.concatenate([self.parent, self.parent[partner]]),
+            np.concatenate([self.is_apart | is_no_pair, np.ones(len(partner), np.bool_)]),
+        )
+
+    def with_parts(self, parts: Parts) -> _Cast:
+        """Parts as objects of their parents' class."""
+        whole = np.where(parts.parent >= 0, parts.parent, np.arange(len(parts.parent)))
+        surfaces = self.surfaces.join(parts.owner, Surface.owned_by)
+        return _Cast(surfaces, self.object_class[whole], parts.parent, self.is_apart[whole])
+
+    def settled(self, voxel_m: float) -> _Cast:
+        """Objects numbered by place, none without a voxel of its own.
+
+        Points of an object whose voxels all belong to others go to those, and objects without points are dropped.
+        """
+        cast = self._by_place()
+        while True:
+            holder = cast.surfaces.map(lambda side: holders(side, voxel_m))
+            has_voxel = np.zeros(len(cast) + 1, np.bool_)
+            for side in holder:
+                has_voxel[side] = True
+            if has_voxel[:-1].all():
+                return cast
+            owner = Pair(
+                *(
+                    np.where(has_voxel[side.owner], side.owner, own).astype(np.int32)
+                    for side, own in zip(cast.surfaces, holder, strict=True)
+                )
+            )
+            cast = replace(cast, surfaces=cast.surfaces.join(owner, Surface.owned_by))._by_place()
+
+    def _by_place(self) -> _Cast:
+        owner = self.surfaces.map(lambda side: side.owner)
+        rank = rank_by_place(self.surfaces.map(lambda side: side.xyz), owner, len(self))
+        is_used = np.zeros(len(self) + 1, np.bool_)
+        for side in owner:
+            is_used[side] = True
+        order = np.argsort(rank)
+        kept: IntArray = order[is_used[order]].astype(np.int32)
+        number = np.full(len(self) + 1, -1, dtype=np.int32)
+        number[kept] = np.arange(len(kept), dtype=np.int32)
+        return _Cast(
+            self.surfaces.join(owner.map(lambda side: number[side]), Surface.owned_by),
+            self.object_class[kept],
+            np.asarray(number[self.parent[kept]], dtype=np.int32),
+            self.is_apart[kept],
+        )
 
 
 class Cue(NamedTuple):
@@ -315,22 +371,3 @@ def _raw(cue: Cue, verdict: Verdict, is_apart: bool, params: ChangeParams, confi
         observability=cue.observability,
         params=confidence,
     )
-
-
-def _renumbered(surfaces: Pair[Surface], parent: IntArray) -> tuple[Pair[Surface], IntArray, IntArray]:
-    """Number objects by place and drop those that lost all their points to parts.
-
-    Returns the surfaces, the old number of each object, and the parents in new numbers.
-    """
-    n = len(parent)
-    owner = surfaces.map(lambda side: side.owner)
-    rank = rank_by_place(surfaces.map(lambda side: side.xyz), owner, n)
-    is_used = np.zeros(n, np.bool_)
-    for side in owner:
-        is_used[side[side >= 0]] = True
-    order = np.argsort(rank)
-    kept: IntArray = order[is_used[order]].astype(np.int32)
-    number = np.full(n + 1, -1, dtype=np.int32)
-    number[kept] = np.arange(len(kept), dtype=np.int32)
-    surfaces = surfaces.join(owner.map(lambda side: number[side]), Surface.owned_by)
-    return surfaces, kept, np.asarray(number[parent[kept]], dtype=np.int32)

@@ -299,14 +299,28 @@ class _Occupied(NamedTuple):
 
 
 def _owned_cells(surface: Surface, voxel_m: float) -> _Occupied:
-    """Voxels that an epoch's objects occupy; the lowest object where several meet."""
+    """Voxels that an epoch's objects occupy; where several meet, the one with most points, then the lowest, has it."""
     is_member = surface.owner >= 0
     rows = np.column_stack([cells_of(surface.xyz[is_member], voxel_m), surface.owner[is_member]])
     points = np.asarray(np.bincount(unique_inverse(rows), weights=surface.n_raw[is_member]), dtype=np.float64)
     rows = unique_rows(rows)
+    order = np.lexsort((rows[:, 3], -points, rows[:, 2], rows[:, 1], rows[:, 0]))
+    rows, points = rows[order], points[order]
     is_first = np.ones(len(rows), np.bool_)
     is_first[1:] = np.any(rows[1:, :3] != rows[:-1, :3], axis=1)
     return _Occupied(rows[is_first, :3], rows[is_first, 3].astype(np.int32), points[is_first])
+
+
+def holders(surface: Surface, voxel_m: float) -> IntArray:
+    """The object that has the voxel of each point (m,), -1 for points without object."""
+    occupied = _owned_cells(surface, voxel_m)
+    holder = np.full(len(surface.xyz), -1, dtype=np.int32)
+    is_member = surface.owner >= 0
+    if is_member.any():
+        lattice = Lattice.around(occupied.cell)
+        found = lattice.find(lattice.keys(occupied.cell), cells_of(surface.xyz[is_member], voxel_m))
+        holder[is_member] = occupied.owner[found]
+    return holder
 
 
 def _spread(
