@@ -320,7 +320,8 @@ def test_memory_is_estimated_before_reading(good: Path, monkeypatch: pytest.Monk
 
 def test_memory_estimate_grows_with_points_and_is_bounded_by_area() -> None:
     assert estimate_memory(2_000_000, 1_000_000) == estimate_memory(1_000_000, 2_000_000)
-    assert estimate_memory(2_000_000, 2_000_000) == 2 * estimate_memory(1_000_000, 1_000_000)
+    nothing, one, two = (estimate_memory(n, n) for n in (0, 1_000_000, 2_000_000))
+    assert two - nothing == 2 * (one - nothing)
     dense, sparse = (estimate_memory(10**8, 10**8, area_m2=14_400.0, leaf_m=leaf) for leaf in (0.25, 0.5))
     assert estimate_memory(10**8, 10**8) > dense > sparse
     # four times the edge squared: the voxel part falls to a quarter
