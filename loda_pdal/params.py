@@ -455,13 +455,13 @@ class ConfidenceParams(StageParams):
     weight_shift: float = param(0.10, "weight of the centroid shift", low=0, high=1)
     weight_displacement: float = param(0.15, "weight of the normal displacement", low=0, high=1)
     calibration_unmatched: tuple[float, ...] = param(
-        (-3.11, 5.57), "logistic offset and slope of Added and Removed", low=-50, high=50
+        (-3.32, 5.9), "logistic offset and slope of Added and Removed", low=-50, high=50
     )
     calibration_changed: tuple[float, ...] = param(
-        (-2.26, 4.63), "logistic offset and slope of Increased and Decreased", low=-50, high=50
+        (-2.29, 4.66), "logistic offset and slope of Increased and Decreased", low=-50, high=50
     )
     calibration_unchanged: tuple[float, ...] = param(
-        (-1.06, 5.65), "logistic offset and slope of Unchanged", low=-50, high=50
+        (-1.02, 5.61), "logistic offset and slope of Unchanged", low=-50, high=50
     )
 
 

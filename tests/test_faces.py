@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import laspy
@@ -54,3 +56,11 @@ def test_the_pipeline(engine: str, block: Path, result: ChangeResult, pipelines_
     }
     assert run_pipeline(pipelines_dir / "change.json", overrides, engine=engine).engine == engine
     check(laspy.read(tmp_path / "out.laz"), result)
+
+
+def test_the_example(block: Path, result: ChangeResult) -> None:
+    example = Path(__file__).parent.parent / "examples" / "largest_changes.py"
+    arguments = [sys.executable, str(example), str(block / "before.laz"), str(block / "after.laz")]
+    done = subprocess.run(arguments, capture_output=True, text=True, timeout=300, check=True)
+    largest = max(result.changes, key=lambda change: change.footprint.area)
+    assert done.stdout.splitlines()[0].endswith(largest.reason)

@@ -4,7 +4,6 @@ The paper minimises its energy (section 4.2, equation 4) with cut-pursuit, which
 nothing is ever cut: one label per voxel at first; nodes move to the neighbouring label that lowers the energy most;
 neighbouring regions merge where the energy falls, exactly computed; regions are contracted to nodes, and again; at the
 end single voxels move on the whole graph. There are no maximum flows and no chance, and every step lowers the energy.
-Compared with cut-pursuit on the same graph it ends lower and takes a fraction of the time (docs/method.md).
 """
 
 from __future__ import annotations
