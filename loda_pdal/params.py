@@ -623,7 +623,7 @@ class Parameters:
         Neighbourhood sizes are written for a 0.25 m fused map. Where `adapts_to_spacing` is set and the survey is
         sparser, all of them are scaled by one factor, so that a neighbourhood keeps its number of points.
         """
-        factor = max(1.0, spacing_m / REFERENCE_SPACING_M)
+        factor = min(max(1.0, spacing_m / REFERENCE_SPACING_M), MOST_SCALING)
         if not self.adapts_to_spacing or factor <= 1.0:
             return self
         factor = math.ceil(factor * 4) / 4  # steps of a quarter: two surveys of nearly equal density get equal grids
@@ -638,6 +638,9 @@ class Parameters:
 
 REFERENCE_SPACING_M = 0.5
 """Point spacing up to which the presets' own neighbourhood sizes are used."""
+
+MOST_SCALING = 4.0
+"""Neighbourhoods grow no more than this: what is sparser than 2 m shows no objects in larger ones either."""
 
 STAGES = tuple(f.name for f in fields(Parameters) if f.name not in ("name", "adapts_to_spacing"))
 

@@ -9,13 +9,13 @@ import pytest
 
 from loda_pdal.benchmark.simulate import SimulatedBlock, SimulationOptions, simulate_block
 from loda_pdal.kernels.parallel import set_threads
-from loda_pdal.model.cloud import FloatArray
+from loda_pdal.model.cloud import FloatArray, to_local_grid
 from loda_pdal.model.frame import LocalFrame
 from loda_pdal.model.labels import ChangeLabel
 from loda_pdal.model.records import ChangeResult, PointLabels
 from loda_pdal.model.survey import Survey
 from loda_pdal.model.transform import invert, transform_points
-from loda_pdal.params import Parameters
+from loda_pdal.params import PRESETS, Parameters
 from loda_pdal.pipeline import detect_changes
 
 SMALL = SimulationOptions(length_m=60.0, density=0.6)
@@ -179,3 +179,17 @@ def test_registration_recovers_a_known_offset() -> None:
     assert transform_points(found.T_after_before, start)[0] == pytest.approx(centre, abs=0.01)
     turn = found.T_after_before[:3, :3] @ truth[:3, :3].T
     assert np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))) < 0.02
+
+
+@pytest.mark.parametrize("n", [0, 1, 10, 200])
+@pytest.mark.parametrize("preset", PRESETS)
+def test_next_to_no_points_give_no_objects_and_a_warning(n: int, preset: str) -> None:
+    rng = np.random.default_rng(n)
+    before, after = (
+        Survey(to_local_grid(np.column_stack([rng.uniform(0, 20, (n, 2)), rng.normal(0, 0.02, n)]))) for _ in range(2)
+    )
+    found = detect_changes(before, after, Parameters.preset(preset))
+    assert found.objects == []
+    assert found.ground_changes == []
+    assert "did not converge" in found.warnings[0]
+    assert [len(side.change) for side in found.points] == [n, n]

@@ -98,3 +98,4 @@ def test_neighbourhoods_grow_with_the_spacing_and_nothing_else_does() -> None:
             if not item.metadata["is_length"]:
                 assert getattr(getattr(sparse, stage), item.name) == getattr(getattr(aerial, stage), item.name)
     assert Parameters.preset("street").for_spacing(1.5) == Parameters.preset("street")
+    assert aerial.for_spacing(100.0) == aerial.for_spacing(2.0)

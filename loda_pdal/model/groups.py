@@ -85,8 +85,8 @@ class Groups:
         mean = np.nan_to_num(self.mean(xyz))
         is_member = self.labels >= 0
         centred = np.where(is_member[:, None], xyz - mean[np.maximum(self.labels, 0)], 0.0)
-        outer = np.einsum("ij,ik->ijk", centred, centred).reshape(len(xyz), -1)
         d = xyz.shape[1]
+        outer = np.einsum("ij,ik->ijk", centred, centred).reshape(len(xyz), d * d)
         return np.asarray(self.sum(outer).reshape(self.n, d, d) / np.maximum(self.counts, 1)[:, None, None])
 
 

@@ -359,7 +359,7 @@ def _displacement(surfaces: Pair[Surface], found: Pair[IntArray]) -> tuple[Float
 
 def _facing(normal: FloatArray, samples: Groups) -> FloatArray:
     """Sign (k,) that turns each normal to the side its object mostly faces; a fitted normal has no sign of its own."""
-    scatter = samples.sum(np.einsum("ij,ik->ijk", normal, normal).reshape(-1, 9)).reshape(-1, 3, 3)
+    scatter = samples.sum(np.einsum("ij,ik->ijk", normal, normal).reshape(len(normal), 9)).reshape(samples.n, 3, 3)
     axis = np.linalg.eigh(scatter)[1][:, :, 2] if len(scatter) else np.zeros((0, 3))
     leading = np.take_along_axis(axis, np.argmax(np.abs(axis), axis=1)[:, None], axis=1)
     axis = np.where(leading < 0, -axis, axis)
