@@ -97,3 +97,26 @@ def calibrate(first: int, last: int, preset: str) -> None:
         click.echo(f"confidence.{name} = [{offset}, {slope}]")
     click.echo(f"training: {found.n_train} objects, expected calibration error {found.error_train:.3f}")
     click.echo(f"validation: {found.n_validation} objects, expected calibration error {found.error_validation:.3f}")
+
+
+@bench.command()
+@click.argument("seeds", type=click.IntRange(0), nargs=-1, required=True)
+@click.option("--preset", default="street", show_default=True, help="Parameters whose limit of detection is checked.")
+def coverage(seeds: tuple[int, ...], preset: str) -> None:
+    """Share of unchanged simulated surface within LoD95, for the blocks of SEEDS surveyed twice without edits."""
+    from loda_pdal.benchmark.coverage import coverage_of, unchanged_grid
+    from loda_pdal.benchmark.metrics import markdown_table
+    from loda_pdal.params import Parameters
+
+    rows = []
+    for seed in seeds:
+        found = coverage_of(unchanged_grid(seed, Parameters.preset(preset)))
+        rows.append(
+            [
+                seed,
+                found["all"].n_cells,
+                *(f"{100 * c.share:.1f}" for c in found.values()),
+                f"{found['all'].median_m:.3f}",
+            ]
+        )
+    click.echo(markdown_table(["seed", "cells", "all, %", "level", "upright", "slanted", "median LoD95, m"], rows))
