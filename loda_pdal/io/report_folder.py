@@ -167,9 +167,9 @@ def _points(
     with laspy.open(path) as reader:
         for points in reader.chunk_iterator(CHUNK):
             full, objects = np.column_stack([points.x, points.y, points.z]), np.asarray(points["ObjectId"])
-            epochs = np.where(np.asarray(points.classification) == ObjectClass.NOISE, -1, points["Epoch"])
+            epochs, is_noise = np.asarray(points["Epoch"]), np.asarray(points.classification) == ObjectClass.NOISE
             for epoch, fused in parts.items():
-                is_here = epochs == epoch
+                is_here = (epochs == epoch) & ~is_noise
                 moved = full[is_here] if epoch else transform_points(T_map, full[is_here])
                 fused.append(_Fused.of(frame.to_local(moved), objects[is_here], leaf_m))
     before, after = (_Fused.joined(fused) for fused in parts.values())
