@@ -384,7 +384,6 @@ class ChangeParams(StageParams):
     building_shift_m: float = param(1.5, "largest centroid shift of a matched building", unit="m", low=0, high=100)
     building_height_m: float = param(0.60, "height change of a building", unit="m", low=0, high=100)
     building_volume_ratio: float = param(0.12, "relative volume change of a building", low=0, high=10)
-    building_same_iou: float = param(0.20, "IoU of an unchanged building", low=0, high=1)
     vegetation_iou: float = param(0.08, "smallest IoU of matched vegetation", low=0, high=1)
     vegetation_shift_m: float = param(2.0, "largest centroid shift of matched vegetation", unit="m", low=0, high=100)
     vegetation_height_m: float = param(0.35, "height change of vegetation", unit="m", low=0, high=100)

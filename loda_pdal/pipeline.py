@@ -18,6 +18,7 @@ import numpy as np
 
 from loda_pdal.assembly import ground_records, instance_records, object_records, outline_of, point_labels
 from loda_pdal.model.cloud import BoolArray, FloatArray, IntArray, VoxelCloud
+from loda_pdal.model.groups import count_cells
 from loda_pdal.model.labels import ChangeLabel, ObjectClass
 from loda_pdal.model.lod_grid import LodGrid
 from loda_pdal.model.pair import Pair
@@ -29,7 +30,7 @@ from loda_pdal.model.records import (
 )
 from loda_pdal.model.registration import Registration
 from loda_pdal.model.survey import Survey
-from loda_pdal.model.transform import rotation_between, transform_points
+from loda_pdal.model.transform import transform_points
 from loda_pdal.params import Parameters
 from loda_pdal.stages.association import Descriptors, Matches, associate, describe
 from loda_pdal.stages.changes import Changes, decide_changes
@@ -37,7 +38,7 @@ from loda_pdal.stages.correspondence import Objects, match_instances, owners
 from loda_pdal.stages.cues import Surface
 from loda_pdal.stages.features import Features, eigen_features
 from loda_pdal.stages.fuse import fuse_points
-from loda_pdal.stages.ground import GroundModel, ground_model
+from loda_pdal.stages.ground import GroundModel, ground_model, vertical_rotation
 from loda_pdal.stages.ground_changes import GroundChanges, ground_changes
 from loda_pdal.stages.instances import Instances, form_instances
 from loda_pdal.stages.lod import level_of_detection
@@ -105,7 +106,7 @@ def detect_changes(
     with clock("semantics"):
         classes = classify_superpoints(clouds, segments, p)
     with clock("instances"):
-        instances = segment_instances(clouds, ground, segments, classes, p)
+        instances = segment_instances(clouds, ground, classes, p)
     with clock("objects"):
         objects = match_objects(clouds, ground, instances, proxies, p)
     with clock("changes"):
@@ -143,15 +144,17 @@ class Segments:
 
 def resolve(parameters: Parameters, points: Pair[FloatArray]) -> Parameters:
     """Parameters for these points (n, 3) m: neighbourhoods grow with the sparser survey's spacing where allowed."""
+    if not parameters.adapts_to_spacing:
+        return parameters
     return parameters.for_spacing(max(mean_spacing(points.before), mean_spacing(points.after)))
 
 
 def mean_spacing(xyz: FloatArray) -> float:
-    """Mean point spacing (m) in plan: root of the area of occupied 2 m cells, with their gaps, per point."""
+    """Mean point spacing (m) in plan: root of the area of occupied 5 m cells, with their gaps, per point."""
     if len(xyz) == 0:
         return 0.0
-    cells = np.unique(np.floor(xyz[:, :2] / _SPACING_CELL_M).astype(np.int64), axis=0)
-    return float(_SPACING_CELL_M * np.sqrt(len(cells) / len(xyz)))
+    n_cells = count_cells(xyz[:, :2], np.zeros(len(xyz), dtype=np.int8), 1, _SPACING_CELL_M)[0]
+    return float(_SPACING_CELL_M * np.sqrt(n_cells / len(xyz)))
 
 
 _SPACING_CELL_M = 5.0
@@ -170,7 +173,7 @@ def register_epochs(fused: Pair[VoxelCloud], p: Parameters) -> Registration:
     clouds = into_frame(fused, registration)
     ups = clouds.map(lambda cloud: ground_model(cloud.xyz, cloud.n_raw, p.ground).up)
     up = ups.before + ups.after
-    return registration.with_vertical(rotation_between(up / np.linalg.norm(up), np.array([0.0, 0.0, 1.0])))
+    return registration.with_vertical(vertical_rotation(up / np.linalg.norm(up)))
 
 
 def into_frame(fused: Pair[VoxelCloud], registration: Registration) -> Pair[VoxelCloud]:
@@ -228,17 +231,14 @@ def classify_superpoints(clouds: Pair[VoxelCloud], segments: Pair[Segments], p: 
 
 
 def segment_instances(
-    clouds: Pair[VoxelCloud], ground: Pair[Ground], segments: Pair[Segments], classes: Pair[Semantics], p: Parameters
+    clouds: Pair[VoxelCloud], ground: Pair[Ground], classes: Pair[Semantics], p: Parameters
 ) -> Pair[Instances]:
     """Instances within each class (section 4.2)."""
 
-    def of_epoch(cloud: VoxelCloud, g: Ground, s: Segments, semantics: Semantics) -> Instances:
+    def of_epoch(cloud: VoxelCloud, g: Ground, semantics: Semantics) -> Instances:
         return form_instances(cloud.xyz, cloud.n_raw, g.height, semantics, p.instances, p.semantics)
 
-    return Pair(
-        of_epoch(clouds.before, ground.before, segments.before, classes.before),
-        of_epoch(clouds.after, ground.after, segments.after, classes.after),
-    )
+    return Pair(*(of_epoch(*each) for each in zip(clouds, ground, classes, strict=True)))
 
 
 def match_objects(

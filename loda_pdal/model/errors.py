@@ -54,7 +54,3 @@ class MemoryLimitError(LodaError, MemoryError):
 
 class PipelineError(LodaError, RuntimeError):
     """A PDAL pipeline, or a stage of one, that cannot run as asked."""
-
-
-class Interrupted(LodaError, RuntimeError):  # noqa: N818 - reads as what happened
-    """The run was stopped from outside; nothing was written under a final name."""

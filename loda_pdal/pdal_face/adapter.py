@@ -45,10 +45,6 @@ class Points:
     def __len__(self) -> int:
         return len(self.ins["X"])
 
-    def has(self, dimension: Dimension) -> bool:
-        """Whether the view has the dimension."""
-        return dimension.name in self.ins
-
     def column(self, name: str) -> npt.NDArray[Any]:
         """A copy of one dimension, (n,), in its own type."""
         if name not in self.ins:

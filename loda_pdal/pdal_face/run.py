@@ -225,9 +225,7 @@ STEPS: dict[str, Callable[[Run], Any]] = {
     "proxies": lambda run: pipeline.match_proxies(run.clouds, run["ground"], run.parameters),
     "superpoints": lambda run: pipeline.form_superpoints(run.clouds, run["ground"], run.parameters),
     "semantics": lambda run: pipeline.classify_superpoints(run.clouds, run["superpoints"], run.parameters),
-    "instances": lambda run: pipeline.segment_instances(
-        run.clouds, run["ground"], run["superpoints"], run["semantics"], run.parameters
-    ),
+    "instances": lambda run: pipeline.segment_instances(run.clouds, run["ground"], run["semantics"], run.parameters),
     "objects": lambda run: pipeline.match_objects(
         run.clouds, run["ground"], run["instances"], run["proxies"], run.parameters
     ),

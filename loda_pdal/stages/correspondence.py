@@ -22,7 +22,7 @@ from loda_pdal.stages.association import Descriptors, Matches, associate
 from loda_pdal.stages.instances import Instances
 from loda_pdal.stages.semantics import merge
 
-_MIN_SHARED = 0.5  # an instance joins the object that holds at least this share of its surface
+_MIN_SHARED = 0.5  # an instance of which the other epoch shows at least this share joins the object that shows most
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,6 @@ class _Votes:
 
     support: FloatArray
     partner: IntArray
-    partner_share: FloatArray
 
 
 def _assign_by_class(instances: Pair[Instances], descriptors: Pair[Descriptors], params: AssociationParams) -> IntArray:
@@ -146,9 +145,9 @@ def _shared_surface(
     n = len(instances)
     members = np.flatnonzero(instances.instance > 0)
     other_members = np.flatnonzero(others.instance > 0)
-    support, partner, share = np.zeros(n), np.full(n, -1, np.int32), np.zeros(n)
+    support, partner = np.zeros(n), np.full(n, -1, np.int32)
     if len(members) == 0 or len(other_members) == 0:
-        return _Votes(support, partner, share)
+        return _Votes(support, partner)
     found, _ = nearest(other_xyz[other_members], xyz[members], reach_m)
     own = instances.instance[members] - 1
     voxels = np.maximum(np.bincount(own, minlength=n), 1)
@@ -162,12 +161,11 @@ def _shared_surface(
     is_first[1:] = own_of[order][1:] != own_of[order][:-1]
     best = order[is_first]
     partner[own_of[best]] = theirs_of[best]
-    share[own_of[best]] = votes[best] / voxels[own_of[best]]
-    return _Votes(support, partner, share)
+    return _Votes(support, partner)
 
 
 def _left_over(votes: _Votes, matched: IntArray) -> IntArray:
-    """Unmatched instances most of whose surface one instance of the other epoch shares."""
+    """Unmatched instances most of whose surface the other epoch's instances show too."""
     is_free = np.ones(len(votes.support), np.bool_)
     is_free[matched] = False
     return np.flatnonzero(is_free & (votes.support >= _MIN_SHARED) & (votes.partner >= 0)).astype(np.int32)

@@ -133,8 +133,6 @@ class Evidence:
         Share of the voxels that both surveys saw or could have seen.
     rise : m
         How far the mean height of occupancy moves up inside the overlap.
-    z_min, z_max : m
-        Lowest and highest point of either epoch, in the analysis frame.
     """
 
     n_points: Pair[FloatArray]
@@ -157,8 +155,6 @@ class Evidence:
     lod95: FloatArray
     observability: FloatArray
     rise: FloatArray
-    z_min: FloatArray
-    z_max: FloatArray
 
 
 def sample_cells(surfaces: Pair[Surface], coverage: Pair[Coverage] | None, lod: LodGrid, params: ChangeParams) -> Cells:
@@ -240,8 +236,6 @@ def weigh(
     is_sampled = samples.counts >= params.min_samples
     displacement = cells.displacement[voxel] * _facing(cells.normal[voxel], samples)
     points = surfaces.map(lambda surface: Groups(surface.owner, n))
-    lowest = points.join(surfaces, lambda group, surface: group.minimum(surface.xyz[:, 2]))
-    highest = points.join(surfaces, lambda group, surface: group.maximum(surface.xyz[:, 2]))
     height = points.join(surfaces, lambda group, surface: group.quantile(surface.height, 0.95))
     columns = Pair(
         _column_tops(surfaces.before, coverage.after if coverage else None, params.voxel_m),
@@ -272,8 +266,6 @@ def weigh(
         lod95=Groups(owner, n).median(cells.lod95[voxel]),
         observability=(n_known.before + n_known.after) / np.maximum(n_voxels.before + n_voxels.after, 1),
         rise=_rise(cells, middle[:, 2], n),
-        z_min=np.fmin(lowest.before, lowest.after),
-        z_max=np.fmax(highest.before, highest.after),
     )
 
 
