@@ -21,7 +21,7 @@ from loda_pdal.model.cloud import BoolArray, FloatArray, IntArray, VoxelCloud
 from loda_pdal.model.groups import count_cells
 from loda_pdal.model.labels import ChangeLabel, ObjectClass
 from loda_pdal.model.lod_grid import LodGrid
-from loda_pdal.model.pair import Pair
+from loda_pdal.model.pair import Pair, at_once
 from loda_pdal.model.records import (
     ChangeResult,
     InstanceRecord,
@@ -162,7 +162,7 @@ _SPACING_CELL_M = 5.0
 
 def fuse_epochs(points: Pair[FloatArray], p: Parameters) -> Pair[VoxelCloud]:
     """One point per voxel, without statistical outliers (section 4.1)."""
-    return points.map(lambda xyz: remove_outliers(fuse_points(xyz, p.fuse), p.outliers))
+    return at_once(lambda xyz: remove_outliers(fuse_points(xyz, p.fuse), p.outliers), points)
 
 
 def register_epochs(fused: Pair[VoxelCloud], p: Parameters) -> Registration:
@@ -171,7 +171,7 @@ def register_epochs(fused: Pair[VoxelCloud], p: Parameters) -> Registration:
     if p.ground.vertical == "plumb":
         return registration
     clouds = into_frame(fused, registration)
-    ups = clouds.map(lambda cloud: ground_model(cloud.xyz, cloud.n_raw, p.ground).up)
+    ups = at_once(lambda cloud: ground_model(cloud.xyz, cloud.n_raw, p.ground).up, clouds)
     up = ups.before + ups.after
     return registration.with_vertical(vertical_rotation(up / np.linalg.norm(up)))
 
@@ -189,7 +189,7 @@ def model_ground(clouds: Pair[VoxelCloud], p: Parameters) -> Pair[Ground]:
         model = ground_model(cloud.xyz, cloud.n_raw, p.ground)
         return Ground(model, cloud.xyz[:, 2] - model.height_at(cloud.xyz[:, :2]))
 
-    return clouds.map(of_epoch)
+    return at_once(of_epoch, clouds)
 
 
 def limit_of_detection(clouds: Pair[VoxelCloud], registration: Registration, p: Parameters) -> LodGrid:
@@ -203,9 +203,10 @@ def match_proxies(clouds: Pair[VoxelCloud], ground: Pair[Ground], p: Parameters)
     """Geometry-only proxies and their assignment (section 4.1)."""
     if not p.proxies.is_enabled:
         return None
-    proxies = clouds.join(
-        ground,
+    proxies = at_once(
         lambda cloud, g: build_proxies(cloud.xyz, g.height, _is_on_ground(g, p), p.proxies, p.association.boxes),
+        clouds,
+        ground,
     )
     return ProxyMatches(proxies, associate(proxies.before.descriptors, proxies.after.descriptors, p.association))
 
@@ -217,16 +218,17 @@ def form_superpoints(clouds: Pair[VoxelCloud], ground: Pair[Ground], p: Paramete
         features = eigen_features(cloud.xyz, g.height, p.features)
         return Segments(features, superpoints(cloud.xyz, features, p.superpoints))
 
-    return clouds.join(ground, of_epoch)
+    return at_once(of_epoch, clouds, ground)
 
 
 def classify_superpoints(clouds: Pair[VoxelCloud], segments: Pair[Segments], p: Parameters) -> Pair[Semantics]:
     """Class of every superpoint (section 4.2)."""
-    return clouds.join(
-        segments,
+    return at_once(
         lambda cloud, s: classify(
             cloud.xyz, p.fuse.leaf_m, s.features, s.superpoints.labels, s.superpoints.n, p.semantics
         ),
+        clouds,
+        segments,
     )
 
 
@@ -238,7 +240,7 @@ def segment_instances(
     def of_epoch(cloud: VoxelCloud, g: Ground, semantics: Semantics) -> Instances:
         return form_instances(cloud.xyz, cloud.n_raw, g.height, semantics, p.instances, p.semantics)
 
-    return Pair(*(of_epoch(*each) for each in zip(clouds, ground, classes, strict=True)))
+    return at_once(of_epoch, clouds, ground, classes)
 
 
 def match_objects(
@@ -249,11 +251,7 @@ def match_objects(
     p: Parameters,
 ) -> Objects:
     """Class-consistent association of the instances (sections 4.1 and 4.2)."""
-    heights = clouds.join(ground, lambda cloud, g: np.where(np.isfinite(g.height), g.height, 0.0))
-    descriptors = Pair(
-        _descriptors(clouds.before, heights.before, instances.before, p),
-        _descriptors(clouds.after, heights.after, instances.after, p),
-    )
+    descriptors = at_once(lambda cloud, g, i: _descriptors(cloud, g, i, p), clouds, ground, instances)
     proxy_pairs = None if proxies is None else (proxies.proxies.map(lambda side: side.proxy), proxies.matches)
     xyz = clouds.map(lambda cloud: cloud.xyz)
     return match_instances(xyz, instances, descriptors, proxy_pairs, p.changes.query_radius_m, p.association)
@@ -275,8 +273,8 @@ def label_objects(
         is_surface = i.classification != ObjectClass.GROUND
         return Surface(cloud.xyz, s.features.normals, g.height, cloud.n_raw, own, is_surface)
 
-    surfaces = Pair(*(surface(*each) for each in zip(clouds, ground, segments, instances, owner, strict=True)))
-    covered = clouds.map(lambda cloud: coverage(cloud.xyz, p.observability))
+    surfaces = at_once(surface, clouds, ground, segments, instances, owner)
+    covered = at_once(lambda cloud: coverage(cloud.xyz, p.observability), clouds)
     return decide_changes(surfaces, objects.object_class, covered, lod, p.changes, p.observability, p.confidence)
 
 
@@ -316,15 +314,8 @@ def assemble(
     return ChangeResult(
         objects=object_records(in_after, instances, changes, _outline_m(p)),
         ground_changes=ground_records(ground_change, registration.T_after_frame),
-        instances=Pair(
-            *(instances_of(*each) for each in zip(clouds, in_after, ground, instances, changes.owner, strict=True))
-        ),
-        points=Pair(
-            *(
-                labels_of(*each)
-                for each in zip(points, moves, clouds, ground, segments, instances, changes.owner, strict=True)
-            )
-        ),
+        instances=at_once(instances_of, clouds, in_after, ground, instances, changes.owner),
+        points=at_once(labels_of, points, moves, clouds, ground, segments, instances, changes.owner),
         registration=registration,
         lod=lod,
         clouds=in_after,
@@ -381,11 +372,11 @@ def _outline_m(p: Parameters) -> float:
     return p.changes.voxel_m
 
 
-def _descriptors(cloud: VoxelCloud, height: FloatArray, instances: Instances, p: Parameters) -> Descriptors:
+def _descriptors(cloud: VoxelCloud, ground: Ground, instances: Instances, p: Parameters) -> Descriptors:
     """What the association compares of one epoch's instances."""
     return describe(
         cloud.xyz,
-        height,
+        np.where(np.isfinite(ground.height), ground.height, 0.0),
         instances.instance,
         len(instances),
         p.proxies.histogram_bins,
