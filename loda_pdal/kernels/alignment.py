@@ -9,21 +9,30 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from loda_pdal.kernels.neighbours import empty_runs, k_nearest, k_within, runs_within
+from loda_pdal.kernels.neighbours import k_nearest
 
 CHUNK = 2048
 """Source points per chunk."""
+
+N_SLOTS = 4096
+"""Cubes whose distributions are remembered, a power of two."""
 
 N_SUMS = 32
 """Values per chunk: 21 of the upper triangle of J'WJ, 6 of J'Wr, then `PAIRS`, `WEIGHT` and `SCORE`."""
 
 PAIRS, WEIGHT, SCORE = 27, 28, 29
 
+SEARCHED = 1.2
+"""Partners are searched within this many radii, so that points without one need not search again at each step."""
+
+ROUNDING_M = 1e-9
+"""More than distances are wrong by for rounding, m."""
+
 
 @njit(nogil=True, cache=True)
 def plane_chunks(  # type: ignore[no-untyped-def]
-    start, stop, source, source_normals, R, t, cells, target, normals, sq_sigma, radius, min_cosine, tau, is_robust,
-    match, residual, weight, sums,
+    start, stop, source, source_normals, R, t, R_last, t_last, cells, target, normals, sq_sigma, radius, min_cosine,
+    tau, is_robust, match, clearance, residual, weight, sums,
 ):  # fmt: skip
     """Point-to-plane pairs of the source points in chunks [start, stop) (paper, equation 1).
 
@@ -31,20 +40,23 @@ def plane_chunks(  # type: ignore[no-untyped-def]
     ----------
     source, source_normals : (m, 3) float32
         Points and unit normals about ``cells.centre``, before the pose.
-    R, t : (3, 3), (3,) float64
-        The pose.
+    R, t, R_last, t_last : (3, 3), (3,) float64
+        The pose, and the one of the last call.
     cells, target, normals, sq_sigma
         Cell list of the target, its points (n, 3) float32 and unit normals (n, 3) by index, and sigma_i^2 (n,), m2.
     radius, min_cosine, tau, is_robust
         Largest distance of a pair, smallest |cosine| between its normals, largest residual, and Tukey's loss or none.
     match : (m,) int32
-        Nearest target point, -1 where there is none; what it holds from an earlier call makes the search quick.
+        Nearest target point, -1 where there is none within `SEARCHED` radii.
+    clearance : (m,) float64, m
+        All target points but the match are at least this far away; 0 before the first call. While the match stays
+        nearer than that, nothing is searched.
     residual, weight : (m,) float64
         Signed distance to the plane, m, and weight / sigma^2; both 0 where there is no pair.
     sums : (chunks, N_SUMS) float64
         Filled; ``SCORE`` is the weighted square sum of residuals and ``WEIGHT`` the weights without 1 / sigma^2.
     """
-    best_sq, best_idx = np.empty(1, dtype=np.float64), np.empty(1, dtype=np.int32)
+    best_sq, best_idx = np.empty(2, dtype=np.float64), np.empty(2, dtype=np.int32)
     J = np.empty(6, dtype=np.float64)
     for chunk in range(start, stop):
         total = sums[chunk]
@@ -52,21 +64,21 @@ def plane_chunks(  # type: ignore[no-untyped-def]
         guess = min(cells.cell_m, radius)
         for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(source))):
             residual[i] = weight[i] = 0.0
-            x, y, z = _moved(R, source[i, 0], source[i, 1], source[i, 2])
-            x, y, z = x + t[0], y + t[1], z + t[2]
-            n_found = 0
-            if match[i] >= 0:
-                dx, dy, dz = target[match[i], 0] - x, target[match[i], 1] - y, target[match[i], 2] - z
-                reach = min(np.sqrt(dx * dx + dy * dy + dz * dz) * (1 + 1e-9), radius)
-                n_found = k_within(cells, x, y, z, reach, -1, best_sq, best_idx)
-            else:
-                n_found, guess = k_nearest(cells, x, y, z, guess, radius, -1, best_sq, best_idx)
-            match[i] = best_idx[0] if n_found else -1
-            if not n_found:
+            x, y, z = _moved(R, t, source[i, 0], source[i, 1], source[i, 2])
+            px, py, pz = _moved(R_last, t_last, source[i, 0], source[i, 1], source[i, 2])
+            clearance[i] -= np.sqrt(_sq_length(x - px, y - py, z - pz)) + ROUNDING_M
+            q, sq = match[i], radius * radius
+            if q >= 0:
+                sq = _sq_length(target[q, 0] - x, target[q, 1] - y, target[q, 2] - z)
+            if clearance[i] <= 0.0 or sq >= clearance[i] * clearance[i]:
+                n_found, guess = k_nearest(cells, x, y, z, guess, SEARCHED * radius, -1, best_sq, best_idx)
+                clearance[i] = np.sqrt(best_sq[1]) if n_found == 2 else SEARCHED * radius
+                match[i] = q = best_idx[0] if n_found else -1
+                sq = best_sq[0]
+            if q < 0 or sq > radius * radius:
                 continue
-            q = best_idx[0]
             nx, ny, nz = np.float64(normals[q, 0]), np.float64(normals[q, 1]), np.float64(normals[q, 2])
-            sx, sy, sz = _moved(R, source_normals[i, 0], source_normals[i, 1], source_normals[i, 2])
+            sx, sy, sz = _turned(R, source_normals[i, 0], source_normals[i, 1], source_normals[i, 2])
             r = nx * (x - target[q, 0]) + ny * (y - target[q, 1]) + nz * (z - target[q, 2])
             if abs(nx * sx + ny * sy + nz * sz) < min_cosine or abs(r) > tau:
                 continue
@@ -82,9 +94,7 @@ def plane_chunks(  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def distribution_chunks(  # type: ignore[no-untyped-def]
-    start, stop, source, R, t, cells, mean, information, radius, outlier, sums
-):
+def distribution_chunks(start, stop, source, R, t, cells, distribution, radius, outlier, sums):  # type: ignore[no-untyped-def]
     """Point-to-distribution pairs of the source points in chunks [start, stop).
 
     Each point is drawn to all distributions within ``radius`` of their means, by weight exp(-d'Bd / 2) over the sum of
@@ -96,37 +106,50 @@ def distribution_chunks(  # type: ignore[no-untyped-def]
         Points about ``cells.centre``, before the pose.
     R, t : (3, 3), (3,) float64
         The pose.
-    cells, mean, information
-        Cell list of the means, the means (n, 3) float32, and B (n, 6): xx xy xz yy yz zz of the inverse covariances.
+    cells, distribution
+        Cell list of the means, and (n, 9) float64 in its order: mean x, y, z, then xx xy xz yy yz zz of the inverse
+        covariance B.
     sums : (chunks, N_SUMS) float64
         Filled; ``SCORE`` is the log likelihood, 0 for a point far from all distributions.
+
+    Notes
+    -----
+    What is near is looked up once for each cube that points fall into; the lists of the last cubes are kept.
     """
-    runs = empty_runs(cells, radius)
+    slots = np.zeros((N_SLOTS, 5), dtype=np.int64)
+    near = np.empty(16 * N_SLOTS + 2 * len(cells.xyz), dtype=np.int32)
+    within = np.empty(len(cells.xyz) + 1, dtype=np.int32)
+    edge, x0, y0, z0 = cells.cell_m, cells.low[0], cells.low[1], cells.low[2]
+    n_near = 0
     for chunk in range(start, stop):
         total = sums[chunk]
         total[:] = 0.0
         for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(source))):
-            x, y, z = _moved(R, source[i, 0], source[i, 1], source[i, 2])
-            x, y, z = x + t[0], y + t[1], z + t[2]
-            n_runs = runs_within(cells, x, y, z, radius, runs)
+            x, y, z = _moved(R, t, source[i, 0], source[i, 1], source[i, 2])
+            cx, cy, cz = int(np.floor((x - x0) / edge)), int(np.floor((y - y0) / edge)), int(np.floor((z - z0) / edge))
+            slot = (cx * 73856093 ^ cy * 19349663 ^ cz * 83492791) & (N_SLOTS - 1)
+            if slots[slot, 0] != cx or slots[slot, 1] != cy or slots[slot, 2] != cz or slots[slot, 4] == 0:
+                n_near = _fill_slot(cells, cx, cy, cz, radius, slots, slot, near, n_near)
             likelihood = 0.0
             bx = by = bz = 0.0  # sum of e B d
             xx = xy = xz = yy = yz = zz = 0.0  # sum of e B
-            for run in range(n_runs):
-                for p in range(runs[run, 0], runs[run, 1]):
-                    d = cells.idx[p]
-                    dx, dy, dz = x - mean[d, 0], y - mean[d, 1], z - mean[d, 2]
-                    if dx * dx + dy * dy + dz * dz > radius * radius:
-                        continue
-                    B = information[d]
-                    ux = B[0] * dx + B[1] * dy + B[2] * dz
-                    uy = B[1] * dx + B[3] * dy + B[4] * dz
-                    uz = B[2] * dx + B[4] * dy + B[5] * dz
-                    e = np.exp(-0.5 * (ux * dx + uy * dy + uz * dz))
-                    likelihood += e
-                    bx, by, bz = bx + e * ux, by + e * uy, bz + e * uz
-                    xx, xy, xz = xx + e * B[0], xy + e * B[1], xz + e * B[2]
-                    yy, yz, zz = yy + e * B[3], yz + e * B[4], zz + e * B[5]
+            n_within = 0
+            for p in range(slots[slot, 3], slots[slot, 4]):
+                d = near[p]
+                dx, dy, dz = x - cells.xyz[d, 0], y - cells.xyz[d, 1], z - cells.xyz[d, 2]
+                within[n_within] = d
+                n_within += dx * dx + dy * dy + dz * dz <= radius * radius
+            for p in range(n_within):
+                d = within[p]
+                dx, dy, dz = x - distribution[d, 0], y - distribution[d, 1], z - distribution[d, 2]
+                ux = distribution[d, 3] * dx + distribution[d, 4] * dy + distribution[d, 5] * dz
+                uy = distribution[d, 4] * dx + distribution[d, 6] * dy + distribution[d, 7] * dz
+                uz = distribution[d, 5] * dx + distribution[d, 7] * dy + distribution[d, 8] * dz
+                e = np.exp(-0.5 * (ux * dx + uy * dy + uz * dz))
+                likelihood += e
+                bx, by, bz = bx + e * ux, by + e * uy, bz + e * uz
+                xx, xy, xz = xx + e * distribution[d, 3], xy + e * distribution[d, 4], xz + e * distribution[d, 5]
+                yy, yz, zz = yy + e * distribution[d, 6], yz + e * distribution[d, 7], zz + e * distribution[d, 8]
             if likelihood <= 0.0:
                 continue
             w = 1.0 / (likelihood + outlier)
@@ -137,12 +160,52 @@ def distribution_chunks(  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _moved(R, x, y, z):  # type: ignore[no-untyped-def]
+def _fill_slot(cells, i, j, k, radius, slots, slot, near, n_near):  # type: ignore[no-untyped-def]
+    """List the sorted points within ``radius`` of a cube, whose edge is that of the cells and which begins where they do.
+
+    A slot holds the cube along x, y, z, and first and last + 1 of its list in ``near``, of which ``n_near`` are in use;
+    it is empty where the last is 0. Once there may be no room, all lists are forgotten. Returns ``n_near``.
+    """
+    edge, low = cells.cell_m, cells.low
+    if n_near + len(cells.xyz) > len(near):
+        n_near = 0
+        slots[:, 4] = 0
+    slots[slot, 0], slots[slot, 1], slots[slot, 2], slots[slot, 3] = i, j, k, n_near
+    x, y, z = low[0] + (i + 0.5) * edge, low[1] + (j + 0.5) * edge, low[2] + (k + 0.5) * edge
+    n = int(radius / edge) + 1
+    for row in range(max(i - n, 0), min(i + n + 1, len(cells.row_start) - 1)):
+        columns = cells.column_y[cells.row_start[row] : cells.row_start[row + 1]]
+        first, last = np.searchsorted(columns, j - n), np.searchsorted(columns, j + n + 1)
+        for p in range(
+            cells.column_start[cells.row_start[row] + first], cells.column_start[cells.row_start[row] + last]
+        ):
+            dx = max(abs(cells.xyz[p, 0] - x) - 0.5 * edge, 0.0)
+            dy = max(abs(cells.xyz[p, 1] - y) - 0.5 * edge, 0.0)
+            dz = max(abs(cells.xyz[p, 2] - z) - 0.5 * edge, 0.0)
+            near[n_near] = p
+            n_near += dx * dx + dy * dy + dz * dz <= radius * radius * (1 + 1e-9)
+    slots[slot, 4] = n_near
+    return n_near
+
+
+@njit(nogil=True, cache=True)
+def _moved(R, t, x, y, z):  # type: ignore[no-untyped-def]
+    x, y, z = _turned(R, x, y, z)
+    return x + t[0], y + t[1], z + t[2]
+
+
+@njit(nogil=True, cache=True)
+def _turned(R, x, y, z):  # type: ignore[no-untyped-def]
     return (
         R[0, 0] * x + R[0, 1] * y + R[0, 2] * z,
         R[1, 0] * x + R[1, 1] * y + R[1, 2] * z,
         R[2, 0] * x + R[2, 1] * y + R[2, 2] * z,
     )
+
+
+@njit(nogil=True, cache=True)
+def _sq_length(x, y, z):  # type: ignore[no-untyped-def]
+    return x * x + y * y + z * z
 
 
 @njit(nogil=True, cache=True)

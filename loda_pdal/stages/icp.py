@@ -15,7 +15,7 @@ from loda_pdal.kernels.alignment import CHUNK, N_SUMS, PAIRS, SCORE, WEIGHT, pla
 from loda_pdal.kernels.neighbours import CellList, build_cells, to_cell_frame
 from loda_pdal.kernels.parallel import run_ranges
 from loda_pdal.model.cloud import BoolArray, Float32Array, FloatArray, IntArray
-from loda_pdal.model.transform import exp_se3, rotate, transform_points
+from loda_pdal.model.transform import IDENTITY, exp_se3, rotate, transform_points
 from loda_pdal.params import IcpParams, NormalParams
 from loda_pdal.stages.fuse import mean_of_voxels, voxel_of_point
 from loda_pdal.stages.ndt import is_covered, symmetric
@@ -219,6 +219,8 @@ class _Level:
     min_cosine: float
     is_robust: bool
     match: IntArray
+    clearance: FloatArray
+    last_pose: FloatArray
 
     @classmethod
     def of(
@@ -247,19 +249,21 @@ class _Level:
             min_cosine=float(np.cos(np.radians(params.max_normal_angle_deg))),
             is_robust=params.loss == "tukey",
             match=np.full(len(source.xyz), -1, dtype=np.int32),
+            clearance=np.zeros(len(source.xyz)),
+            last_pose=IDENTITY.copy(),
         )
 
     def pair(self, T: FloatArray) -> _Pairs:
-        """All pairs at a pose; ``match`` is kept, so that the next search begins with these partners."""
+        """All pairs at a pose. What it finds is kept, so that at the next pose few points need search again."""
         n = len(self.source_xyz)
         n_chunks = -(-n // CHUNK)
         residual, weight, sums = np.empty(n), np.empty(n), np.empty((n_chunks, N_SUMS))
         run_ranges(
-            plane_chunks, n_chunks, self.source_xyz, self.source.normals, np.ascontiguousarray(T[:3, :3]),
-            np.ascontiguousarray(T[:3, 3]), self.cells, self.target_xyz, self.target.normals, self.sq_sigma,
-            self.radius_m, self.min_cosine, self.tau_m, self.is_robust, self.match, residual, weight, sums,
-            min_size=1,
+            plane_chunks, n_chunks, self.source_xyz, self.source.normals, *_parts(T), *_parts(self.last_pose),
+            self.cells, self.target_xyz, self.target.normals, self.sq_sigma, self.radius_m, self.min_cosine, self.tau_m,
+            self.is_robust, self.match, self.clearance, residual, weight, sums, min_size=1,
         )  # fmt: skip
+        self.last_pose[:] = T
         return _Pairs(self.match, residual, weight, sums.sum(axis=0))
 
     def axes(self, pairs: _Pairs) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -273,6 +277,11 @@ class _Level:
         feigned = self.tilt * max(pairs.sums[WEIGHT] - self.sq_sigma0 * np.trace(H[:3, :3]), 0.0)
         needed = max(MIN_INFORMATION * information[-1], MIN_INFORMATION_OVER_NOISE * feigned)
         return information, directions, np.asarray(information > needed)
+
+
+def _parts(T: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rotation (3, 3) and shift (3,) of a pose, as the kernels take them."""
+    return np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
 
 
 def _tau(level: _Level, T: FloatArray, params: IcpParams) -> float:

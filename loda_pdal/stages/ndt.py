@@ -139,18 +139,19 @@ class _Level:
     cell_m: float
     source: FloatArray
     mean: FloatArray
-    information: FloatArray
     cells: CellList
+    distribution: FloatArray
 
     @classmethod
     def of(cls, source: FloatArray, target: FloatArray, cell_m: float, params: NdtParams) -> _Level:
         mean, information = distributions(target, cell_m, params.min_points)
+        cells = build_cells(mean, cell_m, np.zeros(3))
         return cls(
             cell_m=cell_m,
             source=downsample(source, SOURCE_LEAF * cell_m),
             mean=mean,
-            information=information,
-            cells=build_cells(mean, cell_m, np.zeros(3)),
+            cells=cells,
+            distribution=np.hstack([cells.xyz, information[cells.idx]], dtype=np.float64),
         )
 
     def source_over_target(self, T: FloatArray) -> Float32Array:
@@ -163,10 +164,9 @@ class _Level:
         n_chunks = -(-len(source) // CHUNK)
         sums = np.empty((n_chunks, N_SUMS))
         R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
-        mean = to_cell_frame(self.cells, self.mean)
         run_ranges(
-            distribution_chunks, n_chunks, source, R, t, self.cells, mean, self.information, REACH * self.cell_m,
-            OUTLIER, sums, min_size=1,
+            distribution_chunks, n_chunks, source, R, t, self.cells, self.distribution, REACH * self.cell_m, OUTLIER,
+            sums, min_size=1,
         )  # fmt: skip
         total = sums.sum(axis=0)
         return symmetric(total[:21]), total[21:27], float(total[SCORE])
