@@ -8,17 +8,18 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
-from loda_pdal.kernels.alignment import CHUNK
+from loda_pdal.kernels.alignment import CHUNK, N_SLOTS
 from loda_pdal.kernels.parallel import set_threads
 from loda_pdal.model.cloud import VoxelCloud, to_local_grid
 from loda_pdal.model.pair import Pair
 from loda_pdal.model.registration import Registration
 from loda_pdal.model.transform import exp_se3, invert, rotation_angle, rotation_matrix, transform_points
 from loda_pdal.params import FuseParams, IcpParams, NdtParams, NormalParams, Parameters
-from loda_pdal.stages import icp
+from loda_pdal.stages import icp, ndt
 from loda_pdal.stages.fuse import fuse_points
-from loda_pdal.stages.icp import fine_pose
+from loda_pdal.stages.icp import Surface, fine_pose
 from loda_pdal.stages.ndt import coarse_pose, distributions
 from loda_pdal.stages.registration import register
 
@@ -276,17 +277,44 @@ def test_a_raised_road_does_not_draw_the_pose() -> None:
     assert error["l2"] > 0.05
 
 
+def test_likelihood_of_many_cells_equals_its_definition() -> None:
+    """On more cubes than the kernel remembers."""
+    rng = np.random.default_rng(0)
+    target, source = (rng.uniform(0, (70, 70, 12), (n, 3)) for n in (500_000, 4 * CHUNK))
+    level = ndt._Level.of(source, target, 1.0, NdtParams())
+    T = exp_se3(np.array([0.2, -0.1, 0.3, 0.01, -0.02, 0.03]))
+    points = level.source_over_target(T)
+    H, g, score = level.normal_equations(points, T)
+    mean, information = distributions(target, 1.0, NdtParams().min_points)
+    B = ndt.symmetric(information, 3)
+    p = transform_points(T, points.astype(np.float64))
+    log_likelihood, gradient, curvature = 0.0, np.zeros(6), np.zeros((6, 6))
+    for point, near in zip(p, cKDTree(mean).query_ball_point(p, 1.5), strict=True):
+        d = point - mean[near]
+        e = np.exp(-0.5 * np.einsum("ki,kij,kj->k", d, B[near], d))
+        if not e.any():
+            continue
+        w = e / (e.sum() + 0.05)
+        J = np.hstack([np.eye(3), np.cross(np.eye(3), point).T])
+        gradient += J.T @ np.einsum("k,kij,kj->i", w, B[near], d)
+        curvature += J.T @ np.einsum("k,kij->ij", w, B[near]) @ J
+        log_likelihood += np.log(e.sum() / 0.05 + 1)
+    assert len(points) > 3 * CHUNK and len(mean) > N_SLOTS
+    np.testing.assert_allclose(score, log_likelihood, rtol=1e-6)
+    np.testing.assert_allclose(g, gradient, rtol=1e-5, atol=1e-5 * np.abs(gradient).max())
+    np.testing.assert_allclose(H, curvature, rtol=1e-5, atol=1e-6 * np.abs(curvature).max())
+
+
 def test_normal_equations_equal_their_definition() -> None:
     before, after = (fused(points).xyz[::12] for points in two_epochs(0))
     params, normal_params = IcpParams(), NormalParams(radius_m=2.0)
-    centre = after.mean(axis=0)
-    source, target = icp._Surface.of(before, normal_params), icp._Surface.of(after, normal_params)
-    level = icp._Level.of(source, target, centre, 0.75, params, normal_params)
+    source, target = Surface.of(before, normal_params), Surface.of(after, normal_params)
+    level = icp._Level.of(source, target, 0.75, params, normal_params)
     T = exp_se3(np.array([0.05, -0.03, 0.02, 0.002, 0.001, -0.003]))
     pairs = level.pair(T)
     assert len(source.xyz) > CHUNK
-    p = transform_points(T, source.xyz - centre)
-    q = target.xyz - centre
+    p = transform_points(T, source.xyz - target.centre)
+    q = target.xyz - target.centre
     H, g, n_pairs = np.zeros((6, 6)), np.zeros(6), 0
     for i, point in enumerate(p):
         distance = np.linalg.norm(q - point, axis=1)
@@ -302,6 +330,19 @@ def test_normal_equations_equal_their_definition() -> None:
     assert pairs.n == pytest.approx(n_pairs, abs=2)  # a pair on the edge of a threshold may fall either way in float32
     assert np.allclose(pairs.normal_matrix, H, rtol=2e-3, atol=1e-3 * np.abs(H).max())
     assert np.allclose(pairs.gradient, g, atol=2e-3 * np.abs(g).max())
+
+
+def test_partners_kept_from_earlier_poses_are_those_of_a_fresh_search() -> None:
+    before, after = (Surface.of(fused(points).xyz[::4], NormalParams(radius_m=2.0)) for points in two_epochs(0))
+    level, rng = icp._Level.of(before, after, 0.75, IcpParams(), NormalParams()), np.random.default_rng(0)
+    T = np.eye(4)
+    for size in (0.0, 0.0, 1e-4, 1e-3, 1e-2, 1e-2, 0.1, 1e-5, 1.0, 1e-3):
+        T = exp_se3(size * rng.normal(0, 1, 6) * [1, 1, 1, 0.02, 0.02, 0.02]) @ T
+        kept, fresh = level.pair(T), icp._Level.of(before, after, 0.75, IcpParams(), NormalParams()).pair(T)
+        assert fresh.n > 100
+        np.testing.assert_array_equal(kept.residual, fresh.residual)
+        np.testing.assert_array_equal(kept.weight, fresh.weight)
+        np.testing.assert_array_equal(kept.sums, fresh.sums)
 
 
 # --- covariance -------------------------------------------------------------------------------------------------------
@@ -322,7 +363,10 @@ def errors_over_sigma(kind: str, noise: Callable[[np.ndarray, np.random.Generato
     items, ratios = houses_and_cars(5), []
     for trial in range(n):
         rng = np.random.default_rng(trial)
-        before, after = (fused(noise(scan(items, 100 + 2 * trial + e, density=12.0), rng) + HERE).xyz for e in (0, 1))
+        before, after = (
+            Surface.of(fused(noise(scan(items, 100 + 2 * trial + e, density=12.0), rng) + HERE).xyz, NormalParams())
+            for e in (0, 1)
+        )
         pose = fine_pose(before, after, np.eye(4), IcpParams(covariance=kind), NormalParams())
         assert np.array_equal(pose.covariance, pose.covariance.T)
         assert np.linalg.eigvalsh(pose.covariance)[0] > 0

@@ -85,8 +85,7 @@ def plane_chunks(  # type: ignore[no-untyped-def]
             tukey = (1 - (r / tau) ** 2) ** 2 if is_robust else 1.0
             w = tukey / sq_sigma[q]
             residual[i], weight[i] = r, w
-            J[0], J[1], J[2] = nx, ny, nz
-            J[3], J[4], J[5] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
+            _fill_row(J, x, y, z, nx, ny, nz)
             _add(total, J, w, r)
             total[PAIRS] += 1
             total[WEIGHT] += tukey
@@ -161,7 +160,7 @@ def distribution_chunks(start, stop, source, R, t, cells, distribution, radius, 
 
 @njit(nogil=True, cache=True)
 def _fill_slot(cells, i, j, k, radius, slots, slot, near, n_near):  # type: ignore[no-untyped-def]
-    """List the sorted points within ``radius`` of a cube, whose edge is that of the cells and which begins where they do.
+    """List the sorted points within ``radius`` of a cube. Cubes have the edge of the cells and begin where they do.
 
     A slot holds the cube along x, y, z, and first and last + 1 of its list in ``near``, of which ``n_near`` are in use;
     it is empty where the last is 0. Once there may be no room, all lists are forgotten. Returns ``n_near``.
@@ -189,6 +188,47 @@ def _fill_slot(cells, i, j, k, radius, slots, slot, near, n_near):  # type: igno
 
 
 @njit(nogil=True, cache=True)
+def plane_blocks(xyz, normals, residual, weight, block, sums):  # type: ignore[no-untyped-def]
+    """Point-to-plane pairs summed by block: ``block`` (k,) of each pair, points (k, 3) float64 after the pose, normals.
+
+    ``sums`` (blocks, `N_SUMS`) is added to, in the order of the pairs.
+    """
+    J = np.empty(6, dtype=np.float64)
+    for i in range(len(xyz)):
+        x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+        _fill_row(J, x, y, z, np.float64(normals[i, 0]), np.float64(normals[i, 1]), np.float64(normals[i, 2]))
+        _add(sums[block[i]], J, weight[i], residual[i])
+
+
+@njit(nogil=True, cache=True)
+def nearest_to_means(xyz, voxel, mean, kept):  # type: ignore[no-untyped-def]
+    """Of the points (m, 3) of each voxel, the one nearest to its mean (v, 3); the first of equally near ones.
+
+    ``kept`` (v,) int64 is filled with their indices; ``voxel`` (m,) int32 leaves none empty.
+    """
+    best_sq = np.full(len(mean), np.inf)
+    for i in range(len(xyz)):
+        v = voxel[i]
+        sq = _sq_length(xyz[i, 0] - mean[v, 0], xyz[i, 1] - mean[v, 1], xyz[i, 2] - mean[v, 2])
+        if sq < best_sq[v]:
+            best_sq[v], kept[v] = sq, i
+
+
+@njit(nogil=True, cache=True)
+def sum_products(xyz, voxel, mean, products):  # type: ignore[no-untyped-def]
+    """Add the products xx, xy, xz, yy, yz, zz of each point's (m, 3) offset from its voxel's mean to (v, 6)."""
+    for i in range(len(xyz)):
+        v = voxel[i]
+        x, y, z = xyz[i, 0] - mean[v, 0], xyz[i, 1] - mean[v, 1], xyz[i, 2] - mean[v, 2]
+        products[v, 0] += x * x
+        products[v, 1] += x * y
+        products[v, 2] += x * z
+        products[v, 3] += y * y
+        products[v, 4] += y * z
+        products[v, 5] += z * z
+
+
+@njit(nogil=True, cache=True)
 def _moved(R, t, x, y, z):  # type: ignore[no-untyped-def]
     x, y, z = _turned(R, x, y, z)
     return x + t[0], y + t[1], z + t[2]
@@ -206,6 +246,13 @@ def _turned(R, x, y, z):  # type: ignore[no-untyped-def]
 @njit(nogil=True, cache=True)
 def _sq_length(x, y, z):  # type: ignore[no-untyped-def]
     return x * x + y * y + z * z
+
+
+@njit(nogil=True, cache=True)
+def _fill_row(J, x, y, z, nx, ny, nz):  # type: ignore[no-untyped-def]
+    """Row of the Jacobian of a point's distance along a normal: the normal, and its moment about the origin."""
+    J[0], J[1], J[2] = nx, ny, nz
+    J[3], J[4], J[5] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
 
 
 @njit(nogil=True, cache=True)

@@ -11,11 +11,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loda_pdal.kernels.alignment import CHUNK, N_SUMS, PAIRS, SCORE, WEIGHT, plane_chunks
+from loda_pdal.kernels.alignment import (
+    CHUNK,
+    N_SUMS,
+    PAIRS,
+    SCORE,
+    WEIGHT,
+    nearest_to_means,
+    plane_blocks,
+    plane_chunks,
+)
 from loda_pdal.kernels.neighbours import CellList, build_cells, to_cell_frame
 from loda_pdal.kernels.parallel import run_ranges
 from loda_pdal.model.cloud import BoolArray, Float32Array, FloatArray, IntArray
-from loda_pdal.model.transform import IDENTITY, exp_se3, rotate, transform_points
+from loda_pdal.model.pair import Pair, at_once
+from loda_pdal.model.transform import IDENTITY, exp_se3, transform_points
 from loda_pdal.params import IcpParams, NormalParams
 from loda_pdal.stages.fuse import mean_of_voxels, voxel_of_point
 from loda_pdal.stages.ndt import is_covered, symmetric
@@ -83,9 +93,48 @@ class FinePose:
     message: str = ""
 
 
+@dataclass(frozen=True)
+class Surface:
+    """The part of a cloud that lies on planes.
+
+    Attributes
+    ----------
+    xyz : (m, 3) float64, m
+        Its points.
+    normals : (m, 3) float32
+        Unit normals.
+    roughness : (m,) float32, m
+        Robust standard deviation about the plane.
+    centre : (3,) float64, m
+        Mean of the whole cloud; zeros where it is empty.
+    """
+
+    xyz: FloatArray
+    normals: Float32Array
+    roughness: Float32Array
+    centre: FloatArray
+
+    @classmethod
+    def of(cls, xyz: FloatArray, params: NormalParams) -> Surface:
+        """Planes of a fused cloud (n, 3)."""
+        found = estimate_normals(xyz, params)
+        on_plane = np.flatnonzero(found.is_valid)
+        centre = xyz.mean(axis=0) if len(xyz) else np.zeros(3)
+        return cls(xyz[on_plane], found.normals[on_plane], found.roughness[on_plane], centre)
+
+    def thinned(self, leaf_m: float) -> Surface:
+        """The point nearest to the mean of each voxel of ``leaf_m``, with its plane; the first of equally near ones."""
+        voxel, n = voxel_of_point(self.xyz, leaf_m)
+        if n == len(self.xyz):
+            return self
+        kept = np.empty(n, dtype=np.int64)
+        nearest_to_means(self.xyz, voxel, mean_of_voxels(self.xyz, voxel, n), kept)
+        return Surface(self.xyz[kept], self.normals[kept], self.roughness[kept], self.centre)
+
+
 def fine_pose(
-    source_xyz: FloatArray,
-    target_xyz: FloatArray,
+    source: Surface,
+    target: Surface,
     T_target_source: FloatArray,
     params: IcpParams,
     normal_params: NormalParams,
@@ -94,29 +143,28 @@ def fine_pose(
 
     Parameters
     ----------
-    source_xyz, target_xyz : (m, 3), (n, 3) float64, m
-        Fused clouds.
+    source, target : Surface
+        Of the fused clouds. A pyramid level keeps one point of each voxel, with its plane.
     T_target_source : (4, 4) float64
         First pose, right to well under the largest correspondence radius.
     params : IcpParams
     normal_params : NormalParams
-        Planes are estimated once, on the fused clouds; a pyramid level keeps the point nearest to the mean of each
-        voxel, with its plane.
+        With which the planes were estimated.
 
     Returns
     -------
     FinePose
         In directions that the surfaces do not hold the first pose is left alone, and it is not converged.
     """
-    source, target = _Surface.of(source_xyz, normal_params), _Surface.of(target_xyz, normal_params)
-    centre = target_xyz.mean(axis=0) if len(target_xyz) else np.zeros(3)
+    centre = target.centre
     if min(len(source.xyz), len(target.xyz)) < MIN_PAIRS:
         message = f"ICP: only {len(source.xyz)} and {len(target.xyz)} points lie on planes."
         return FinePose(T_target_source, UNKNOWN_POSE.copy(), centre, False, (), 0, float("nan"), 0.0, message)
     T = _about(centre, T_target_source)
     iterations: list[int] = []
     for leaf_m, radius_m, max_iterations in zip(params.leaves_m, params.radii_m, params.max_iterations, strict=True):
-        level = _Level.of(source.thinned(leaf_m), target.thinned(leaf_m), centre, radius_m, params, normal_params)
+        own, other = at_once(Surface.thinned, Pair(source, target), Pair(leaf_m, leaf_m))
+        level = _Level.of(own, other, radius_m, params, normal_params)
         level = replace(level, tau_m=_tau(level, T, params))
         T, n, last_step = _descend(level, T, max_iterations, params.stop_update)
         iterations.append(n)
@@ -143,30 +191,6 @@ def _about(centre: FloatArray, T: FloatArray) -> FloatArray:
     moved = T.copy()
     moved[:3, 3] += T[:3, :3] @ centre - centre
     return moved
-
-
-@dataclass(frozen=True)
-class _Surface:
-    """Points that lie on planes: xyz (m, 3) float64, unit normals (m, 3), roughness (m,) m."""
-
-    xyz: FloatArray
-    normals: Float32Array
-    roughness: Float32Array
-
-    @classmethod
-    def of(cls, xyz: FloatArray, params: NormalParams) -> _Surface:
-        found = estimate_normals(xyz, params)
-        return cls(xyz[found.is_valid], found.normals[found.is_valid], found.roughness[found.is_valid])
-
-    def thinned(self, leaf_m: float) -> _Surface:
-        """The point nearest to the mean of each voxel of ``leaf_m``; the first of equally near ones."""
-        voxel, n = voxel_of_point(self.xyz, leaf_m)
-        if n == len(self.xyz):
-            return self
-        sq_distance = ((self.xyz - mean_of_voxels(self.xyz, voxel, n)[voxel]) ** 2).sum(axis=1)
-        order = np.lexsort((sq_distance, voxel))
-        kept = order[np.flatnonzero(np.diff(voxel[order], prepend=-1))]
-        return _Surface(self.xyz[kept], self.normals[kept], self.roughness[kept])
 
 
 @dataclass(frozen=True)
@@ -205,8 +229,8 @@ class _Level:
     a shift. ``tilt`` is the variance of a normal, rad2, per m2 of squared roughness.
     """
 
-    source: _Surface
-    target: _Surface
+    source: Surface
+    target: Surface
     cells: CellList
     source_xyz: Float32Array
     target_xyz: Float32Array
@@ -225,14 +249,13 @@ class _Level:
     @classmethod
     def of(
         cls,
-        source: _Surface,
-        target: _Surface,
-        centre: FloatArray,
+        source: Surface,
+        target: Surface,
         radius_m: float,
         params: IcpParams,
         normal_params: NormalParams,
     ) -> _Level:
-        cells = build_cells(target.xyz, radius_m, centre)
+        cells = build_cells(target.xyz, radius_m, target.centre)
         target_xyz = to_cell_frame(cells, target.xyz)
         return cls(
             source=source,
@@ -326,14 +349,15 @@ def _scale(lever_m: float) -> FloatArray:
 
 
 def _finite_inverse(H: FloatArray, lever_m: float) -> FloatArray:
-    """Inverse of a normal matrix (6, 6), at most 100 m in a direction without information."""
+    """Inverse of normal matrices (..., 6, 6), at most 100 m in a direction without information."""
     information, directions = np.linalg.eigh(H / _scale(lever_m))
-    return _symmetric((directions / np.maximum(information, 1e-4)) @ directions.T / _scale(lever_m))
+    scaled = directions / np.maximum(information, 1e-4)[..., None, :]
+    return _symmetric(scaled @ np.swapaxes(directions, -1, -2) / _scale(lever_m))
 
 
 def _symmetric(matrix: FloatArray) -> FloatArray:
-    """The matrix without the rounding that makes it differ from its transpose."""
-    return np.asarray((matrix + matrix.T) / 2)
+    """Matrices (..., d, d) without the rounding that makes them differ from their transposes."""
+    return np.asarray((matrix + np.swapaxes(matrix, -1, -2)) / 2)
 
 
 def _block_covariance(level: _Level, pairs: _Pairs, T: FloatArray, block_m: float) -> FloatArray:
@@ -343,21 +367,16 @@ def _block_covariance(level: _Level, pairs: _Pairs, T: FloatArray, block_m: floa
     solution without a block is linearised about the full one, which costs one 6x6 system.
     """
     is_pair = pairs.weight > 0
-    w, r = pairs.weight[is_pair], pairs.residual[is_pair]
     p = transform_points(T, level.source_xyz[is_pair].astype(np.float64))
-    n = level.target.normals[pairs.match[is_pair]].astype(np.float64)
-    J = np.hstack([n, np.cross(p, n)])
+    normals = level.target.normals[pairs.match[is_pair]]
     block, n_blocks = _ground_blocks(p, block_m)
     if n_blocks < 2:
         return np.zeros((6, 6))
-    H, g = np.empty((n_blocks, 6, 6)), np.empty((n_blocks, 6))
-    for a in range(6):
-        wJ = w * J[:, a]
-        g[:, a] = np.bincount(block, weights=wJ * r, minlength=n_blocks)
-        for b in range(a, 6):
-            H[:, a, b] = H[:, b, a] = np.bincount(block, weights=wJ * J[:, b], minlength=n_blocks)
-    H_without, g_without = H.sum(axis=0) - H, g.sum(axis=0) - g
-    steps = np.stack([-_finite_inverse(H_without[b], level.lever_m) @ g_without[b] for b in range(n_blocks)])
+    own = np.zeros((n_blocks, N_SUMS))
+    plane_blocks(p, normals, pairs.residual[is_pair], pairs.weight[is_pair], block, own)
+    without = own.sum(axis=0) - own
+    steps = -_finite_inverse(symmetric(without[:, :21]), level.lever_m) @ without[:, 21:27, None]
+    steps = steps[..., 0]
     deviation = steps - steps.mean(axis=0)
     return np.asarray((n_blocks - 1) / n_blocks * deviation.T @ deviation)
 
@@ -397,11 +416,10 @@ def _paired_share(level: _Level, pairs: _Pairs, T: FloatArray) -> float:
     share is taken of the sums of n n' / sigma^2 and not of the points; rough surfaces (crowns) count for little.
     """
     p = transform_points(T, level.source_xyz.astype(np.float64))
-    n = rotate(T, level.source.normals.astype(np.float64))
-    n /= np.sqrt(level.sq_sigma0 + level.source.roughness.astype(np.float64) ** 2)[:, None]
     is_joint = is_covered(p, level.target_xyz.astype(np.float64), COVERED_M)
-    is_pair = is_joint & (pairs.weight > 0)
-    of_all, of_pairs = n[is_joint].T @ n[is_joint], n[is_pair].T @ n[is_pair]
+    weight = is_joint / (level.sq_sigma0 + level.source.roughness.astype(np.float64) ** 2)
+    n = level.source.normals.astype(np.float64)
+    of_all, of_pairs = (np.einsum("ki,kj->ij", n * w[:, None], n) for w in (weight, weight * (pairs.weight > 0)))
     sums, directions = np.linalg.eigh(of_all)
     whiten = directions / np.sqrt(np.maximum(sums, 1e-9))
     return float(np.linalg.eigvalsh(whiten.T @ of_pairs @ whiten)[0])

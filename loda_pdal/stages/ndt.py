@@ -7,13 +7,14 @@ coarse cells and is sharp in the fine ones.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
-from loda_pdal.kernels.alignment import CHUNK, N_SUMS, SCORE, distribution_chunks
+from loda_pdal.kernels.alignment import CHUNK, N_SUMS, SCORE, distribution_chunks, sum_products
 from loda_pdal.kernels.neighbours import CellList, build_cells, to_cell_frame
-from loda_pdal.kernels.parallel import run_ranges
+from loda_pdal.kernels.parallel import run_ranges, thread_count
 from loda_pdal.model.cloud import BoolArray, Float32Array, FloatArray
 from loda_pdal.model.transform import IDENTITY, exp_se3, transform_points
 from loda_pdal.params import NdtParams
@@ -83,7 +84,9 @@ def coarse_pose(source_xyz: FloatArray, target_xyz: FloatArray, params: NdtParam
     if len(source_xyz) == 0 or len(target_xyz) == 0:
         return CoarsePose(IDENTITY.copy(), False, (), -np.inf, "NDT: a cloud is empty.")
     centre = target_xyz.mean(axis=0)
-    levels = [_Level.of(source_xyz - centre, target_xyz - centre, cell_m, params) for cell_m in params.cells_m]
+    source, target = source_xyz - centre, target_xyz - centre
+    with ThreadPoolExecutor(thread_count()) as pool:
+        levels = list(pool.map(lambda cell_m: _Level.of(source, target, cell_m, params), params.cells_m))
     best = _best_start(levels[:N_SCOUTED], params)
     for level in levels[N_SCOUTED:]:
         best = _climb(level, best, params)
@@ -104,14 +107,11 @@ def distributions(xyz: FloatArray, cell_m: float, min_points: int) -> tuple[Floa
     voxel, n = voxel_of_point(xyz, cell_m)
     mean = mean_of_voxels(xyz, voxel, n)
     count = np.bincount(voxel, minlength=n)
-    offset = xyz - mean[voxel]
-    covariance = np.empty((n, 3, 3))
-    for a in range(3):
-        for b in range(a, 3):
-            products = np.bincount(voxel, weights=offset[:, a] * offset[:, b], minlength=n) / count
-            covariance[:, a, b] = covariance[:, b, a] = products
+    products = np.zeros((n, 6))
+    sum_products(xyz, voxel, mean, products)
     is_kept = count >= min_points
-    widened = covariance[is_kept] + (WIDENING * cell_m) ** 2 * np.eye(3)
+    covariance = symmetric(products[is_kept] / count[is_kept, None], 3)
+    widened = covariance + (WIDENING * cell_m) ** 2 * np.eye(3)
     return mean[is_kept], np.ascontiguousarray(np.linalg.inv(widened)[:, *np.triu_indices(3)])
 
 
@@ -124,12 +124,12 @@ def is_covered(xyz: FloatArray, other_xyz: FloatArray, cell_m: float) -> BoolArr
     return np.asarray(is_held[cell[: len(xyz)]])
 
 
-def symmetric(upper: FloatArray) -> FloatArray:
-    """The symmetric (6, 6) matrix of an upper triangle (21,), row by row."""
-    H = np.empty((6, 6))
-    H[np.triu_indices(6)] = upper
-    H.T[np.triu_indices(6)] = upper
-    return H
+def symmetric(upper: FloatArray, d: int = 6) -> FloatArray:
+    """Symmetric matrices (..., d, d) of their upper triangles (..., d (d + 1) / 2), row by row."""
+    row, column = np.triu_indices(d)
+    full = np.empty((*upper.shape[:-1], d, d))
+    full[..., row, column] = full[..., column, row] = upper
+    return full
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ import numpy as np
 
 from loda_pdal.kernels.neighbours import nearest
 from loda_pdal.model.cloud import FloatArray, VoxelCloud
-from loda_pdal.model.pair import Pair
+from loda_pdal.model.pair import Pair, at_once
 from loda_pdal.model.registration import Registration
 from loda_pdal.model.transform import IDENTITY, invert, transform_points
 from loda_pdal.params import Parameters
 from loda_pdal.stages.fuse import downsample
-from loda_pdal.stages.icp import FinePose, fine_pose
+from loda_pdal.stages.icp import FinePose, Surface, fine_pose
 from loda_pdal.stages.ndt import coarse_pose
 
 MISFIT_LEAF_M = 1.0
@@ -74,32 +74,35 @@ def _find_pose(source_xyz: FloatArray, target_xyz: FloatArray, parameters: Param
     if parameters.ndt.is_enabled:
         coarse = coarse_pose(source_xyz, target_xyz, parameters.ndt)
         first = better_pose(source_xyz, target_xyz, start, coarse.T_target_source)
-    pose = fine_pose(source_xyz, target_xyz, first, parameters.icp, parameters.normals)
+    source, target = at_once(lambda xyz: Surface.of(xyz, parameters.normals), Pair(source_xyz, target_xyz))
+    pose = fine_pose(source, target, first, parameters.icp, parameters.normals)
     if pose.converged or first is start:
         return pose
-    alone = fine_pose(source_xyz, target_xyz, start, parameters.icp, parameters.normals)
+    alone = fine_pose(source, target, start, parameters.icp, parameters.normals)
     T = better_pose(source_xyz, target_xyz, alone.T_target_source, pose.T_target_source)
     return alone if alone.converged or T is alone.T_target_source else pose
 
 
 def choose_reference(clouds: Pair[VoxelCloud]) -> str:
     """The epoch that stands still: the one with more voxels, else the one with the larger coordinate sums."""
-    before, after = clouds.map(lambda cloud: (len(cloud), *cloud.xyz.sum(axis=0)))
-    return "before" if before > after else "after"
+    before, after = clouds.map(len)
+    if before != after:
+        return "before" if before > after else "after"
+    sums = clouds.map(lambda cloud: tuple(cloud.xyz.sum(axis=0)))
+    return "before" if sums.before > sums.after else "after"
 
 
 def better_pose(
     source_xyz: FloatArray, target_xyz: FloatArray, T_simple: FloatArray, T_found: FloatArray
 ) -> FloatArray:
-    """``T_found`` where it lays the source (m, 3) clearly better on the target (n, 3) than ``T_simple``, else that."""
+    """``T_found`` where it lays the source (m, 3) clearly better on the target (n, 3) than ``T_simple``, else that.
+
+    What counts is the mean distance of the source points to the target, each at most `MISFIT_LIMIT_M`.
+    """
     if len(source_xyz) == 0 or len(target_xyz) == 0:
         return T_simple
     points = downsample(source_xyz, MISFIT_LEAF_M)
-    simple, found = (misfit(transform_points(T, points), target_xyz) for T in (T_simple, T_found))
+    moved = np.vstack([transform_points(T, points) for T in (T_simple, T_found)])
+    _, distance = nearest(target_xyz, moved, MISFIT_LIMIT_M)
+    simple, found = np.minimum(distance, MISFIT_LIMIT_M).reshape(2, -1).mean(axis=1, dtype=np.float64)
     return T_found if found < (1 - MIN_GAIN) * simple else T_simple
-
-
-def misfit(xyz: FloatArray, target_xyz: FloatArray) -> float:
-    """Mean distance of points (m, 3) to the nearest target point (n, 3), each at most `MISFIT_LIMIT_M`, m."""
-    _, distance = nearest(target_xyz, xyz, MISFIT_LIMIT_M)
-    return float(np.minimum(distance, MISFIT_LIMIT_M).mean(dtype=np.float64))
