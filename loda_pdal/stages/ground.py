@@ -15,6 +15,15 @@ import numpy as np
 from scipy import ndimage
 
 from loda_pdal.kernels.ground_planes import fit_planes
+from loda_pdal.kernels.ground_raster import (
+    cell_range,
+    group_by_cell,
+    height_range,
+    lower_to,
+    relax,
+    sort_range,
+)
+from loda_pdal.kernels.parallel import run_ranges
 from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array, IntArray
 from loda_pdal.model.transform import rotation_between
 from loda_pdal.params import GroundParams
@@ -77,20 +86,18 @@ class GroundModel:
         """Ground height (k,) m at plan positions (k, 2) m; NaN where there is none. Continuous where defined."""
         if self.height.size == 0 or len(xy) == 0:
             return np.full(len(xy), np.nan)
-        scaled = xy / self.cell_m - 0.5 - self.first
-        base = np.floor(scaled).astype(np.int64)
-        part = scaled - base
-        total, weight = np.zeros(len(xy)), np.zeros(len(xy))
-        for offset in np.ndindex(2, 2):
-            i, j = base[:, 0] + offset[0], base[:, 1] + offset[1]
-            is_inside = (i >= 0) & (i < self.height.shape[0]) & (j >= 0) & (j < self.height.shape[1])
-            i, j = np.where(is_inside, i, 0), np.where(is_inside, j, 0)
-            away = (part - offset) * self.cell_m
-            plane = self.height[i, j] + np.sum(self.slope[i, j] * away, axis=1)
-            w = np.prod(1.0 - np.abs(part - offset), axis=1) * (is_inside & np.isfinite(plane))
-            total += w * np.where(w > 0, plane, 0.0)
-            weight += w
-        return np.where(weight > 1e-9, total / np.maximum(weight, 1e-9), np.nan)
+        result = np.empty(len(xy))
+        run_ranges(
+            height_range,
+            len(xy),
+            np.ascontiguousarray(xy),
+            float(self.cell_m),
+            self.first,
+            self.height,
+            self.slope,
+            result,
+        )
+        return result
 
 
 def ground_model(xyz: FloatArray, n_raw: IntArray, params: GroundParams) -> GroundModel:
@@ -116,8 +123,8 @@ def ground_model(xyz: FloatArray, n_raw: IntArray, params: GroundParams) -> Grou
     if len(xyz) == 0:
         return _without_planes(params.cell_m, np.zeros(2, np.int64), np.zeros((0, 0)))
     fine, coarse = _raster(xyz, params.cell_m / 2), _raster(xyz, params.cell_m)
-    surface = _terrain(_lowest(xyz, fine), fine.cell_m, params)
-    planes = _cell_planes(xyz, n_raw, _near(xyz, fine, surface), params)
+    surface = _terrain(_lowest(xyz[:, 2], fine), fine.cell_m, params)
+    planes = _cell_planes(xyz, n_raw, _near(xyz, fine, surface), coarse, params)
     model = _filled(planes, coarse, params)
     return model if _has_ground(xyz, model, fine, params) else _above_lowest(surface, fine)
 
@@ -129,7 +136,7 @@ def vertical_rotation(up: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Raster:
-    """Cells of a dense raster in plan: first cell and shape as in `GroundModel`, and each point's row and column."""
+    """Cells of a dense raster in plan: first cell and shape as in `GroundModel`, and each point's cell, row by row."""
 
     cell_m: float
     first: Int64Array
@@ -146,17 +153,21 @@ class _Planes:
 
 
 def _raster(xyz: FloatArray, cell_m: float) -> _Raster:
-    cells = np.floor(xyz[:, :2] / cell_m).astype(np.int64)
-    first = cells.min(axis=0)
-    shape = cells.max(axis=0) - first + 1
-    return _Raster(cell_m, first, (int(shape[0]), int(shape[1])), cells - first)
+    first, last = (
+        np.array([np.floor(xyz[:, axis].min() / cell_m) for axis in (0, 1)], dtype=np.int64),
+        np.array([np.floor(xyz[:, axis].max() / cell_m) for axis in (0, 1)], dtype=np.int64),
+    )
+    n_x, n_y = (int(n) for n in last - first + 1)
+    cell_idx = np.empty(len(xyz), dtype=np.int64)
+    run_ranges(cell_range, len(xyz), np.ascontiguousarray(xyz), float(cell_m), first, n_y, cell_idx)
+    return _Raster(cell_m, first, (n_x, n_y), cell_idx)
 
 
-def _lowest(xyz: FloatArray, raster: _Raster) -> FloatArray:
-    """Lowest point of each cell, m; NaN where there is none."""
+def _lowest(values: FloatArray, raster: _Raster) -> FloatArray:
+    """Least of the values (m,) in each cell; NaN where there is none."""
     lowest = np.full(raster.shape, np.inf)
-    np.minimum.at(lowest, (raster.cell_idx[:, 0], raster.cell_idx[:, 1]), xyz[:, 2])
-    return np.where(np.isfinite(lowest), lowest, np.nan)
+    lower_to(lowest.reshape(-1), raster.cell_idx, np.ascontiguousarray(values))
+    return np.where(lowest < np.inf, lowest, np.nan)
 
 
 def _terrain(lowest: FloatArray, cell_m: float, params: GroundParams) -> FloatArray:
@@ -209,21 +220,26 @@ def _near(xyz: FloatArray, raster: _Raster, surface: FloatArray) -> BoolArray:
     padded = np.pad(surface, 1, mode="edge")
     rise_x = np.abs(padded[2:, 1:-1] - padded[:-2, 1:-1]) / 2
     rise_y = np.abs(padded[1:-1, 2:] - padded[1:-1, :-2]) / 2
-    i, j = raster.cell_idx[:, 0], raster.cell_idx[:, 1]
-    return np.asarray(np.abs(xyz[:, 2] - surface[i, j]) < CANDIDATE_M + (rise_x + rise_y)[i, j])
+    tolerance = CANDIDATE_M + (rise_x + rise_y)
+    return np.asarray(np.abs(xyz[:, 2] - surface.ravel()[raster.cell_idx]) < tolerance.ravel()[raster.cell_idx])
 
 
-def _cell_planes(xyz: FloatArray, n_raw: IntArray, is_candidate: BoolArray, params: GroundParams) -> _Planes:
+def _cell_planes(
+    xyz: FloatArray, n_raw: IntArray, is_candidate: BoolArray, raster: _Raster, params: GroundParams
+) -> _Planes:
     """Planes of the cells whose candidates make one (paper: at least 200 inliers; METHOD 1.1: scaled with density)."""
-    points, weight = xyz[is_candidate], n_raw[is_candidate].astype(np.int64)
-    cells = np.floor(points[:, :2] / params.cell_m).astype(np.int64)
-    order = np.lexsort((points[:, 2], points[:, 1], points[:, 0], cells[:, 1], cells[:, 0]))
-    points, weight, cells = points[order], weight[order], cells[order]
-    is_new = np.ones(len(cells), np.bool_)
-    is_new[1:] = np.any(cells[1:] != cells[:-1], axis=1)
-    start = np.append(np.flatnonzero(is_new), len(cells)).astype(np.int64)
-    own = cells[is_new]
-    points[:, :2] -= (cells + 0.5) * params.cell_m
+    candidates = np.flatnonzero(is_candidate)
+    cell_idx = raster.cell_idx[candidates]
+    count = np.bincount(cell_idx, minlength=raster.shape[0] * raster.shape[1])
+    occupied = np.flatnonzero(count)
+    start = np.append(0, np.cumsum(count[occupied]))
+    order = np.empty(len(candidates), dtype=np.int64)
+    group_by_cell(cell_idx, np.cumsum(count) - count, order)
+    points = xyz[candidates]
+    run_ranges(sort_range, len(occupied), start, points, order, min_size=256)
+    points, weight = points[order], n_raw[candidates[order]].astype(np.int64)
+    own = np.column_stack(np.divmod(occupied, raster.shape[1])) + raster.first
+    points[:, :2] -= np.repeat((own + 0.5) * params.cell_m, count[occupied], axis=0)
     plane, n_inliers, n_raw_inliers = fit_planes(
         points,
         weight,
@@ -255,8 +271,7 @@ def _filled(planes: _Planes, raster: _Raster, params: GroundParams) -> GroundMod
 def _has_ground(xyz: FloatArray, model: GroundModel, fine: _Raster, params: GroundParams) -> bool:
     """Whether the planes are the ground of a whole scene, and not the feet of objects cut out of one."""
     distance = np.abs(xyz[:, 2] - model.height_at(xyz[:, :2]))
-    farthest = np.full(fine.shape, -np.inf)
-    np.maximum.at(farthest, (fine.cell_idx[:, 0], fine.cell_idx[:, 1]), np.nan_to_num(distance, nan=np.inf))
+    farthest = -_lowest(-np.nan_to_num(distance, nan=np.inf), fine)
     is_open = farthest[farthest >= 0] < 2 * params.inlier_m
     return bool(np.mean(is_open) >= MIN_OPEN_SHARE)
 
@@ -279,10 +294,7 @@ def _fill(height: FloatArray, sweeps: int = 100) -> FloatArray:
     if is_known.all() or not is_known.any():
         return height
     filled = np.where(is_known, height, _from_blocks(height))
-    for _ in range(sweeps):
-        padded = np.pad(filled, 1, mode="edge")
-        mean = (padded[2:, 1:-1] + padded[:-2, 1:-1] + padded[1:-1, 2:] + padded[1:-1, :-2]) / 4
-        filled = np.where(is_known, height, mean)
+    relax(filled, np.flatnonzero(~is_known), sweeps)
     return filled
 
 
