@@ -58,21 +58,25 @@ def _is_before(xyz, p, q):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def relax(height, gaps, sweeps):  # type: ignore[no-untyped-def]
-    """Replace the cells ``gaps`` (g,) of a raster by the mean of their four neighbours, all at once, ``sweeps`` times.
+def relax(height, is_known, sweeps):  # type: ignore[no-untyped-def]
+    """Replace the cells that are not known by the mean of their four neighbours, all at once, ``sweeps`` times.
 
-    Beyond the edge lies what lies on it. ``height`` is changed.
+    Beyond the edge of a raster (nx, ny) lies what lies on it. Returns the result; ``height`` is overwritten too.
     """
     n_x, n_y = height.shape
-    mean = np.empty(len(gaps))
+    old, new = height, height.copy()
     for _ in range(sweeps):
-        for g in range(len(gaps)):
-            i, j = gaps[g] // n_y, gaps[g] % n_y
-            east, west = height[min(i + 1, n_x - 1), j], height[max(i - 1, 0), j]
-            north, south = height[i, min(j + 1, n_y - 1)], height[i, max(j - 1, 0)]
-            mean[g] = (east + west + north + south) / 4
-        for g in range(len(gaps)):
-            height[gaps[g] // n_y, gaps[g] % n_y] = mean[g]
+        for i in range(n_x):
+            east, west = old[min(i + 1, n_x - 1)], old[max(i - 1, 0)]
+            row, known, out = old[i], is_known[i], new[i]
+            for j in range(1, n_y - 1):
+                mean = (east[j] + west[j] + row[j + 1] + row[j - 1]) / 4
+                out[j] = row[j] if known[j] else mean
+            for j in (0, n_y - 1):
+                if not known[j]:
+                    out[j] = (east[j] + west[j] + row[min(j + 1, n_y - 1)] + row[max(j - 1, 0)]) / 4
+        old, new = new, old
+    return old
 
 
 @njit(nogil=True, cache=True)

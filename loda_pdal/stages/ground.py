@@ -294,8 +294,7 @@ def _fill(height: FloatArray, sweeps: int = 100) -> FloatArray:
     if is_known.all() or not is_known.any():
         return height
     filled = np.where(is_known, height, _from_blocks(height))
-    relax(filled, np.flatnonzero(~is_known), sweeps)
-    return filled
+    return np.asarray(relax(filled, is_known, sweeps))
 
 
 def _from_blocks(height: FloatArray) -> FloatArray:
