@@ -1,4 +1,4 @@
-"""Both epochs around each cell of the LoD grid: common plane direction, noise and offset of each epoch."""
+"""LoD grid: direction, noise and offset of both epochs around each cell, and the limit between cells."""
 
 from __future__ import annotations
 
@@ -101,3 +101,64 @@ def _offset_and_noise(points, n, nx, ny, nz):  # type: ignore[no-untyped-def]
             total += along[p]
             count += 1
     return (total / count if count > 0 else middle), sigma
+
+
+@njit(nogil=True, cache=True)
+def limit_range(start, stop, xyz, cells, cell_m, lod95, is_valid, otherwise, result):  # type: ignore[no-untyped-def]
+    """Limits (m) at points [start, stop), linear between the valid ones of the eight cell centres around each.
+
+    Parameters
+    ----------
+    xyz : (k, 3) float64, m
+    cells, lod95, is_valid : (c, 3) int32, (c,) float32, (c,) bool
+        Cells in lexicographic order, their limits (m) and whether they count.
+    otherwise : float, m
+        The answer where none of the eight counts.
+    result : (k,) float64, m
+        Filled.
+    """
+    around = np.empty(8, dtype=np.int64)
+    i = j = k = 0
+    is_known = False
+    for p in range(start, stop):
+        x, y, z = xyz[p, 0] / cell_m - 0.5, xyz[p, 1] / cell_m - 0.5, xyz[p, 2] / cell_m - 0.5
+        low_x, low_y, low_z = np.floor(x), np.floor(y), np.floor(z)
+        if not is_known or int(low_x) != i or int(low_y) != j or int(low_z) != k:
+            i, j, k, is_known = int(low_x), int(low_y), int(low_z), True
+            for corner in range(0, 8, 2):
+                first = _first_cell(cells, i + (corner >> 2), j + (corner >> 1 & 1), k)
+                for dz in range(2):
+                    around[corner + dz] = _place_in_column(
+                        cells, first, i + (corner >> 2), j + (corner >> 1 & 1), k + dz
+                    )
+        x, y, z = x - low_x, y - low_y, z - low_z
+        total = weight = 0.0
+        for corner in range(8):
+            c = around[corner]
+            if c >= 0 and is_valid[c]:
+                w = (x if corner & 4 else 1 - x) * (y if corner & 2 else 1 - y) * (z if corner & 1 else 1 - z)
+                total += w * lod95[c]
+                weight += w
+        result[p] = total / weight if weight > 1e-6 else otherwise
+
+
+@njit(nogil=True, cache=True)
+def _first_cell(cells, i, j, k):  # type: ignore[no-untyped-def]
+    """First of the cells that does not come before (i, j, k)."""
+    a, b = 0, len(cells)
+    while a < b:
+        m = (a + b) >> 1
+        if cells[m, 0] < i or (cells[m, 0] == i and (cells[m, 1] < j or (cells[m, 1] == j and cells[m, 2] < k))):
+            a = m + 1
+        else:
+            b = m
+    return a
+
+
+@njit(nogil=True, cache=True)
+def _place_in_column(cells, first, i, j, k):  # type: ignore[no-untyped-def]
+    """Which of the cells from ``first`` on is (i, j, k), at most two are asked; -1 if neither."""
+    for c in range(first, min(first + 2, len(cells))):
+        if cells[c, 0] == i and cells[c, 1] == j and cells[c, 2] == k:
+            return c
+    return -1

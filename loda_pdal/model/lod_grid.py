@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from loda_pdal.kernels.lod_pooling import limit_range
+from loda_pdal.kernels.parallel import run_ranges
 from loda_pdal.model.cloud import BoolArray, Float32Array, FloatArray, IntArray
-from loda_pdal.model.grid import Lattice
 from loda_pdal.model.transform import transform_points
 
 
@@ -65,17 +66,16 @@ class LodGrid:
         """
         if len(self.cells) == 0 or len(xyz) == 0:
             return np.full(len(xyz), self.low_observability_m)
-        lattice = Lattice.around(self.cells.astype(np.int64))
-        keys = lattice.keys(self.cells.astype(np.int64))
-        scaled = xyz / self.cell_m - 0.5
-        base = np.floor(scaled).astype(np.int64)
-        part = scaled - base
-        total, weight = np.zeros(len(xyz)), np.zeros(len(xyz))
-        for corner in np.ndindex(2, 2, 2):
-            offset = np.array(corner)
-            position = lattice.find(keys, base + offset)
-            is_hit = (position >= 0) & self.is_valid[position]
-            w = np.prod(np.where(offset, part, 1 - part), axis=1) * is_hit
-            total += w * self.lod95[position]
-            weight += w
-        return np.where(weight > 1e-6, total / np.maximum(weight, 1e-6), self.low_observability_m)
+        result = np.empty(len(xyz))
+        run_ranges(
+            limit_range,
+            len(xyz),
+            np.ascontiguousarray(xyz, dtype=np.float64),
+            self.cells,
+            float(self.cell_m),
+            self.lod95,
+            self.is_valid,
+            float(self.low_observability_m),
+            result,
+        )
+        return result

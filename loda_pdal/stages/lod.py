@@ -7,12 +7,12 @@ import numpy as np
 from loda_pdal.kernels.lod_pooling import pool_range
 from loda_pdal.kernels.neighbours import build_cells, middle_of, to_cell_frame
 from loda_pdal.kernels.parallel import run_ranges
-from loda_pdal.model.cloud import FloatArray
+from loda_pdal.model.cloud import FloatArray, Int64Array
 from loda_pdal.model.grid import cells_of
-from loda_pdal.model.groups import unique_rows
 from loda_pdal.model.lod_grid import LodGrid
 from loda_pdal.params import LodParams
 from loda_pdal.stages.drift import SURFACE_NOISE_M, drift_covariance, rigid_part
+from loda_pdal.stages.fuse import voxel_of_point
 
 Z_95 = 1.96
 """Two-sided 95 % of the normal distribution."""
@@ -48,7 +48,7 @@ def level_of_detection(
     Paper, section 4.1, equation 2; METHOD 1.4 to 1.6: cells in 3D, full pose covariance, noise of each epoch about
     its own plane. Beyond the paper: small samples and drift (see `drift`), without which 95 % would not be 95 %.
     """
-    cells = unique_rows(cells_of(np.vstack([before_xyz, after_xyz]), params.cell_m))
+    cells = _occupied_cells(np.vstack([before_xyz, after_xyz]), params.cell_m)
     n_cells = len(cells)
     centres = np.asarray((cells + 0.5) * params.cell_m, dtype=np.float64)
     n_points = np.zeros((n_cells, 2), np.int32)
@@ -100,6 +100,14 @@ def level_of_detection(
         low_observability_m=params.low_observability_m,
         drift=drift,
     )
+
+
+def _occupied_cells(xyz: FloatArray, cell_m: float) -> Int64Array:
+    """Cells (c, 3) that hold a point (m, 3), in lexicographic order."""
+    cell, n_cells = voxel_of_point(xyz, cell_m)
+    one_of_cell = np.zeros(n_cells, dtype=np.int64)
+    one_of_cell[cell] = np.arange(len(xyz))
+    return cells_of(xyz[one_of_cell], cell_m)
 
 
 def pose_jacobian(xyz: FloatArray, normal: FloatArray, centre: FloatArray, pose_term: str) -> FloatArray:
