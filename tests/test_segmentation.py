@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from loda_pdal.kernels.clusters import components
 from loda_pdal.model.cloud import FloatArray, IntArray, to_local_grid
 from loda_pdal.model.groups import Groups
 from loda_pdal.model.labels import ObjectClass
@@ -14,7 +15,7 @@ from loda_pdal.params import FuseParams, Parameters
 from loda_pdal.stages.features import eigen_features
 from loda_pdal.stages.fuse import fuse_points
 from loda_pdal.stages.instances import Instances, dbscan, euclidean_clusters, form_instances, split_crowns
-from loda_pdal.stages.semantics import classify, fit_planes, merge, support_area, touching
+from loda_pdal.stages.semantics import classify, fit_planes, support_area, touching
 from loda_pdal.stages.superpoints import superpoints
 
 STREET = Parameters.preset("street")
@@ -115,7 +116,7 @@ def test_clusters_agree_with_all_pairs() -> None:
     reach = np.where(rng.random(400) < 0.2, rng.uniform(0.7, 1.5, 400), 0.7)
     gap = np.linalg.norm(xyz[:, None] - xyz[None], axis=2)
     links = np.argwhere(gap <= np.minimum(reach[:, None], reach[None]))
-    expected = merge(links, 400)
+    expected = components(links, 400)
     found = euclidean_clusters(xyz, 0.7, reach)
     assert len(set(zip(expected.tolist(), found.tolist(), strict=True))) == expected.max() + 1 == found.max() + 1
 
@@ -166,4 +167,4 @@ def test_segments_that_touch_are_named_once() -> None:
     pairs, contact = touching(xyz, np.array([0, 0, 1, 1, -1, 2], np.int32), 0.3)
     assert pairs.tolist() == [[0, 1]]
     assert contact.tolist() == [2]
-    assert merge(np.array([[0, 2], [3, 4]]), 5).tolist() == [0, 1, 0, 2, 2]
+    assert components(np.array([[0, 2], [3, 4]]), 5).tolist() == [0, 1, 0, 2, 2]

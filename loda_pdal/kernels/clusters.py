@@ -1,4 +1,7 @@
-"""Clusters of points that are linked by distance: union-find over a cell list, no list of links is ever held."""
+"""Connected components by union-find: of points linked by distance or by their normals, of pairs of nodes.
+
+Points are joined as their links are found; no list of links is ever held.
+"""
 
 from __future__ import annotations
 
@@ -33,36 +36,96 @@ def linked(xyz: npt.NDArray[Any], radius: float, reach: npt.NDArray[Any] | None 
     parent = np.arange(len(xyz), dtype=np.int32)
     if len(xyz) == 0:
         return parent
-    _link(build_cells(xyz, radius), radius, np.full(len(xyz), radius), np.arange(len(xyz), dtype=np.int32), parent)
+    _link(build_cells(xyz, radius), float(radius), np.zeros(0), parent.copy(), parent)
     if reach is not None:
         far = np.flatnonzero(np.asarray(reach) > radius).astype(np.int32)
         if len(far):
-            longest = float(np.max(reach))
-            _link(build_cells(xyz[far], longest), longest, np.asarray(reach, dtype=np.float64)[far], far, parent)
+            far_reach = np.asarray(reach, dtype=np.float64)[far]
+            longest = float(far_reach.max())
+            _link(build_cells(xyz[far], longest), longest, far_reach, far, parent)
+    _settle(parent)
+    return parent
+
+
+def components(pairs: npt.NDArray[Any], n: int) -> IntArray:
+    """Connected components (n,) int32 of ``n`` nodes under the pairs (e, 2), numbered by their lowest node."""
+    parent = np.arange(n, dtype=np.int32)
+    _join_pairs(np.ascontiguousarray(pairs, dtype=np.int32), parent)
+    _settle(parent)
+    return _numbered(parent)
+
+
+def smooth_pieces(
+    neighbour: IntArray, normals: npt.NDArray[np.float32], labels: IntArray, least_cosine: float
+) -> IntArray:
+    """Pieces of labelled points: neighbours of one label are linked where their normals agree.
+
+    Parameters
+    ----------
+    neighbour : (n, k) int32
+        Neighbours of each point, -1 padded.
+    normals : (n, 3) float32
+        Unit normals; their sign does not matter.
+    labels : (n,) int32
+    least_cosine : float
+        Linked are neighbours whose normals have a larger cosine than this.
+
+    Returns
+    -------
+    (n,) int32
+        Piece of each point: the lowest index in it.
+    """
+    parent = np.arange(len(neighbour), dtype=np.int32)
+    _join_smooth(neighbour, normals, labels, float(least_cosine), parent)
     _settle(parent)
     return parent
 
 
 @njit(nogil=True, cache=True)
 def _link(cells, radius, reach, index, parent):  # type: ignore[no-untyped-def]
+    """Join sorted points within ``radius`` and, where given, within their ``reach``; ``index`` is theirs in parent."""
     runs = empty_runs(cells, radius)
     for q in range(len(cells.xyz)):
         x, y, z = cells.xyz[q, 0], cells.xyz[q, 1], cells.xyz[q, 2]
-        own = cells.idx[q]
+        root = _root(parent, index[cells.idx[q]])
+        limit = radius
         for r in range(runs_within(cells, x, y, z, radius, runs)):
             for p in range(runs[r, 0], min(runs[r, 1], q)):
-                limit = min(reach[own], reach[cells.idx[p]])
+                other = index[cells.idx[p]]
+                if parent[other] == root:
+                    continue
+                if len(reach):
+                    limit = min(reach[cells.idx[q]], reach[cells.idx[p]])
                 if sq_distance(cells, p, x, y, z) <= limit * limit:
-                    _join(parent, index[own], index[cells.idx[p]])
+                    root = _join(parent, root, other)
+
+
+@njit(nogil=True, cache=True)
+def _join_pairs(pairs, parent):  # type: ignore[no-untyped-def]
+    for e in range(len(pairs)):
+        _join(parent, pairs[e, 0], pairs[e, 1])
+
+
+@njit(nogil=True, cache=True)
+def _join_smooth(neighbour, normals, labels, least_cosine, parent):  # type: ignore[no-untyped-def]
+    for i in range(len(neighbour)):
+        for j in neighbour[i]:
+            if j < 0 or labels[i] != labels[j] or parent[i] == parent[j]:
+                continue
+            cosine = 0.0
+            for d in range(3):
+                cosine += np.float64(normals[i, d]) * np.float64(normals[j, d])
+            if abs(cosine) > least_cosine:
+                _join(parent, i, j)
 
 
 @njit(nogil=True, cache=True)
 def _join(parent, a, b):  # type: ignore[no-untyped-def]
+    """Join the trees of a and b; their common root."""
     a, b = _root(parent, a), _root(parent, b)
-    if a < b:
-        parent[b] = a
-    elif b < a:
-        parent[a] = b
+    low, high = min(a, b), max(a, b)
+    parent[high] = low
+    return low
 
 
 @njit(nogil=True, cache=True)
@@ -77,3 +140,17 @@ def _root(parent, a):  # type: ignore[no-untyped-def]
 def _settle(parent):  # type: ignore[no-untyped-def]
     for a in range(len(parent)):
         parent[a] = _root(parent, a)
+
+
+@njit(nogil=True, cache=True)
+def _numbered(parent):  # type: ignore[no-untyped-def]
+    """Settled roots numbered in ascending order: a root is never behind its tree."""
+    number = np.empty(len(parent), dtype=np.int32)
+    n = 0
+    for a in range(len(parent)):
+        if parent[a] == a:
+            number[a] = n
+            n += 1
+        else:
+            number[a] = number[parent[a]]
+    return number

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from loda_pdal.kernels.clusters import components
 from loda_pdal.kernels.neighbours import nearest
 from loda_pdal.model.cloud import ByteArray, FloatArray, IntArray
 from loda_pdal.model.groups import Groups
@@ -20,7 +21,6 @@ from loda_pdal.model.pair import Pair
 from loda_pdal.params import AssociationParams
 from loda_pdal.stages.association import Descriptors, Matches, associate
 from loda_pdal.stages.instances import Instances
-from loda_pdal.stages.semantics import merge
 
 _MIN_SHARED = 0.5  # an instance of which the other epoch shows at least this share joins the object that shows most
 
@@ -87,7 +87,7 @@ def match_instances(
         np.column_stack([only_before, votes.before.partner[only_before] + n_before]),
         np.column_stack([votes.after.partner[only_after], only_after + n_before]),
     ]
-    component = merge(np.concatenate(joins).astype(np.int64), n_before + len(instances.after))
+    component = components(np.concatenate(joins).astype(np.int64), n_before + len(instances.after))
     return _numbered(xyz, instances, component, pairs, votes)
 
 

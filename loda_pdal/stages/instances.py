@@ -9,14 +9,14 @@ from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from loda_pdal.kernels.clusters import linked
+from loda_pdal.kernels.clusters import components, linked
 from loda_pdal.kernels.neighbours import count_neighbours, nearest, radius_neighbours
 from loda_pdal.model.boxes import upright_boxes
 from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, Int64Array, IntArray
 from loda_pdal.model.groups import Groups, consecutive
 from loda_pdal.model.labels import ObjectClass
 from loda_pdal.params import InstanceParams, SemanticParams
-from loda_pdal.stages.semantics import Semantics, fit_planes, merge, voxel_volume
+from loda_pdal.stages.semantics import Semantics, fit_planes, voxel_volume
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def _held_by_buildings(
     is_high = is_free & (np.nan_to_num(groups.quantile(height, 0.95)) > rules.building_top_m)
     a, b = semantics.adjacency[:, 0], semantics.adjacency[:, 1]
     is_linked = (is_building | is_high)[a] & (is_building | is_high)[b]
-    linked = merge(semantics.adjacency[is_linked], groups.n)
+    linked = components(semantics.adjacency[is_linked], groups.n)
     has_building = np.zeros(groups.n, np.bool_)
     has_building[linked[is_building]] = True
     is_held = is_building | (is_high & has_building[linked])
@@ -183,7 +183,7 @@ def _buildings_by_patches(xyz: FloatArray, n_raw: IntArray, semantics: Semantics
         is_parallel = np.abs(np.sum(planes.normal[a] * planes.normal[b], axis=1)) >= np.cos(
             np.radians(params.patch_angle_deg)
         )
-        building = merge(pairs[is_parallel & (boxes.footprint_overlap(a, b) > params.patch_iou)], n_patches)
+        building = components(pairs[is_parallel & (boxes.footprint_overlap(a, b) > params.patch_iou)], n_patches)
     points = groups.sum(n_raw)
     total = np.bincount(building, weights=points, minlength=n_patches)
     is_large = total[building] >= params.patch_min_points

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from loda_pdal.kernels.clusters import components, smooth_pieces
+from loda_pdal.kernels.contacts import contact_keys
 from loda_pdal.kernels.neighbours import knn
 from loda_pdal.model.boxes import upright_boxes
 from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, Int64Array, IntArray
@@ -144,13 +144,8 @@ def split_at_edges(
     if len(members) == 0:
         return superpoint, n_superpoints
     neighbour, _ = knn(xyz[members], 9, 2.5 * leaf_m)
-    source = np.repeat(np.arange(len(members)), neighbour.shape[1])
-    target = neighbour.ravel()
-    source, target = source[target >= 0], target[target >= 0]
-    normals = features.normals[members].astype(np.float64)
-    is_smooth = np.abs(np.sum(normals[source] * normals[target], axis=1)) > np.cos(np.radians(params.split_angle_deg))
-    is_kept = is_smooth & (superpoint[members][source] == superpoint[members][target])
-    piece = merge(np.column_stack([source, target])[is_kept], len(members))
+    least_cosine = np.cos(np.radians(params.split_angle_deg))
+    piece = smooth_pieces(neighbour, features.normals[members], superpoint[members], least_cosine)
     label = superpoint.astype(np.int64)
     label[members] = n_superpoints + piece
     return consecutive(label)
@@ -169,21 +164,9 @@ def touching(xyz: FloatArray, labels: IntArray, reach_m: float) -> tuple[Int64Ar
     if len(xyz) == 0:
         return np.zeros((0, 2), np.int64), np.zeros(0, np.int64)
     neighbour, _ = knn(xyz, 9, reach_m)
-    first = np.repeat(labels.astype(np.int64), neighbour.shape[1])
-    flat = neighbour.ravel()
-    is_edge = (flat >= 0) & (first >= 0)
-    first, second = first[is_edge], labels[flat[is_edge]].astype(np.int64)
-    is_edge = (first != second) & (second >= 0)
-    low, high = np.minimum(first, second)[is_edge], np.maximum(first, second)[is_edge]
-    key, contact = np.unique(low * (int(labels.max()) + 1) + high, return_counts=True)
-    pairs = np.column_stack(np.divmod(key, int(labels.max()) + 1)) if len(key) else np.zeros((0, 2), np.int64)
-    return pairs, contact.astype(np.int64)
-
-
-def merge(pairs: Int64Array, n: int) -> IntArray:
-    """Connected components of ``n`` nodes under the pairs (e, 2), numbered by their lowest node."""
-    graph = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int32)
+    n = int(labels.max()) + 1
+    key, contact = np.unique(contact_keys(neighbour, labels, n), return_counts=True)
+    return np.column_stack(np.divmod(key, max(n, 1))), contact.astype(np.int64)
 
 
 def _ground(groups: Groups, values: np.ndarray, height: FloatArray, params: SemanticParams) -> BoolArray:
@@ -203,7 +186,7 @@ def _coplanar(
         np.abs(np.sum(planes.normal[a] * offset, axis=1)), np.abs(np.sum(planes.normal[b] * offset, axis=1))
     )
     is_merged = is_planar[a] & is_planar[b] & is_parallel & (gap < distance_m)
-    return np.where(is_planar, merge(adjacency[is_merged], len(is_planar)), -1).astype(np.int32)
+    return np.where(is_planar, components(adjacency[is_merged], len(is_planar)), -1).astype(np.int32)
 
 
 def _building(
