@@ -12,6 +12,7 @@ import numpy.typing as npt
 from numba import njit
 
 from loda_pdal.kernels.neighbours import build_cells, empty_runs, runs_within, sq_distance
+from loda_pdal.kernels.parallel import run_ranges
 
 IntArray = npt.NDArray[np.int32]
 
@@ -47,12 +48,47 @@ def linked(xyz: npt.NDArray[Any], radius: float, reach: npt.NDArray[Any] | None 
     return parent
 
 
+def dbscan(xyz: npt.NDArray[Any], weight: IntArray, radius: float, least_weight: int) -> IntArray:
+    """DBSCAN clusters of points (n, 3), m; a core point has ``least_weight`` within ``radius``, itself included.
+
+    Returns
+    -------
+    (n,) int32
+        Cluster of each point: the lowest index of its core points; -1 noise. A point that is no core joins the cluster
+        of its nearest core (ties: lowest index), so the order of the points does not matter.
+    """
+    parent = np.arange(len(xyz), dtype=np.int32)
+    if len(xyz) == 0:
+        return parent
+    cells = build_cells(xyz, radius)
+    is_core = np.zeros(len(xyz), dtype=np.bool_)
+    run_ranges(_core_range, len(xyz), cells, weight.astype(np.int32), float(radius), least_weight, is_core)
+    _link(cells, float(radius), np.where(is_core, float(radius), 0.0), parent.copy(), parent)
+    _settle(parent)
+    cluster: IntArray = np.where(is_core, parent, -1)
+    precise = np.ascontiguousarray(xyz, dtype=np.float64)
+    run_ranges(_border_range, len(xyz), cells, precise, is_core, float(radius), cluster)
+    return cluster
+
+
+def count_some(xyz: npt.NDArray[Any], radius: float, enough: int) -> IntArray:
+    """How many points of a cloud (n, 3) lie within ``radius``, m, of each of its points, itself included, (n,) int32.
+
+    Counting stops somewhere behind ``enough``.
+    """
+    counts = np.zeros(len(xyz), dtype=np.int32)
+    if len(xyz):
+        run_ranges(_count_range, len(xyz), build_cells(xyz, radius), float(radius), enough, counts)
+    return counts
+
+
 def components(pairs: npt.NDArray[Any], n: int) -> IntArray:
     """Connected components (n,) int32 of ``n`` nodes under the pairs (e, 2), numbered by their lowest node."""
     parent = np.arange(n, dtype=np.int32)
     _join_pairs(np.ascontiguousarray(pairs, dtype=np.int32), parent)
     _settle(parent)
-    return _numbered(parent)
+    number: IntArray = _numbered(parent)
+    return number
 
 
 def smooth_pieces(
@@ -83,21 +119,75 @@ def smooth_pieces(
 
 @njit(nogil=True, cache=True)
 def _link(cells, radius, reach, index, parent):  # type: ignore[no-untyped-def]
-    """Join sorted points within ``radius`` and, where given, within their ``reach``; ``index`` is theirs in parent."""
+    """Join points of the cell list within ``radius`` and, where given, both ``reach``; ``index`` is theirs in parent.
+
+    The trees are grown in the order of the list, where neighbours stand close together, and then handed to ``parent``.
+    """
+    n = len(cells.xyz)
+    tree = np.arange(n, dtype=np.int32)
     runs = empty_runs(cells, radius)
-    for q in range(len(cells.xyz)):
+    limit = radius
+    for q in range(n):
         x, y, z = cells.xyz[q, 0], cells.xyz[q, 1], cells.xyz[q, 2]
-        root = _root(parent, index[cells.idx[q]])
-        limit = radius
+        root = q
         for r in range(runs_within(cells, x, y, z, radius, runs)):
             for p in range(runs[r, 0], min(runs[r, 1], q)):
-                other = index[cells.idx[p]]
-                if parent[other] == root:
+                if tree[p] == root:
                     continue
                 if len(reach):
                     limit = min(reach[cells.idx[q]], reach[cells.idx[p]])
                 if sq_distance(cells, p, x, y, z) <= limit * limit:
-                    root = _join(parent, root, other)
+                    root = _join(tree, root, p)
+    for q in range(n):
+        _join(parent, index[cells.idx[q]], index[cells.idx[tree[q]]])
+
+
+@njit(nogil=True, cache=True)
+def _core_range(start, stop, cells, weight, radius, least_weight, is_core):  # type: ignore[no-untyped-def]
+    runs = empty_runs(cells, radius)
+    for q in range(start, stop):
+        x, y, z = cells.xyz[q, 0], cells.xyz[q, 1], cells.xyz[q, 2]
+        reached = 0
+        for r in range(runs_within(cells, x, y, z, radius, runs)):
+            for p in range(runs[r, 0], runs[r, 1]):
+                if sq_distance(cells, p, x, y, z) <= radius * radius:
+                    reached += weight[cells.idx[p]]
+        is_core[cells.idx[q]] = reached >= least_weight
+
+
+@njit(nogil=True, cache=True)
+def _border_range(start, stop, cells, xyz, is_core, radius, cluster):  # type: ignore[no-untyped-def]
+    """Give points that are no core the cluster of the nearest one in reach."""
+    runs = empty_runs(cells, radius)
+    for q in range(start, stop):
+        own, host, least = cells.idx[q], -1, np.inf
+        if is_core[own]:
+            continue
+        x, y, z = cells.xyz[q, 0], cells.xyz[q, 1], cells.xyz[q, 2]
+        for r in range(runs_within(cells, x, y, z, radius, runs)):
+            for p in range(runs[r, 0], runs[r, 1]):
+                other = cells.idx[p]
+                if is_core[other] and sq_distance(cells, p, x, y, z) <= radius * radius:
+                    dx, dy, dz = xyz[own, 0] - xyz[other, 0], xyz[own, 1] - xyz[other, 1], xyz[own, 2] - xyz[other, 2]
+                    distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+                    if distance < least or (distance == least and other < host):
+                        least, host = distance, other
+        if host >= 0:
+            cluster[own] = cluster[host]
+
+
+@njit(nogil=True, cache=True)
+def _count_range(start, stop, cells, radius, enough, counts):  # type: ignore[no-untyped-def]
+    runs = empty_runs(cells, radius)
+    for q in range(start, stop):
+        x, y, z = cells.xyz[q, 0], cells.xyz[q, 1], cells.xyz[q, 2]
+        count = 0
+        for r in range(runs_within(cells, x, y, z, radius, runs)):
+            for p in range(runs[r, 0], runs[r, 1]):
+                count += sq_distance(cells, p, x, y, z) <= radius * radius
+            if count >= enough:
+                break
+        counts[cells.idx[q]] = count
 
 
 @njit(nogil=True, cache=True)

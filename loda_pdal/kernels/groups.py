@@ -135,4 +135,4 @@ def _select(values: Array, n: int, rank: int) -> float:
             left = i
         else:
             break
-    return values[rank]
+    return float(values[rank])

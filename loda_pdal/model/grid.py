@@ -34,7 +34,7 @@ class Lattice:
     @property
     def has_keys(self) -> bool:
         """Whether the keys of all its cells are integers of 64 bits."""
-        return math.prod(self.span.tolist()) < 2**63
+        return bool(math.prod(self.span.tolist()) < 2**63)
 
     def keys(self, cells: Int64Array) -> Int64Array:
         """Key of each cell (k, d); only meaningful for cells inside."""

@@ -15,7 +15,7 @@ from loda_pdal.kernels.groups import (
     sort_by_label,
 )
 from loda_pdal.kernels.parallel import run_ranges
-from loda_pdal.model.cloud import FloatArray, Int64Array
+from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array
 from loda_pdal.model.grid import Lattice, cells_of
 
 
@@ -49,6 +49,11 @@ class Groups:
         sort_by_label(np.ascontiguousarray(labels, dtype=np.int32), self.starts, order)
         self.order = order[: self.starts[-1]]
         self.counts: Int64Array = np.diff(self.starts)
+
+    def only(self, is_kept: BoolArray) -> Groups:
+        """The groups where ``is_kept`` (n,), under the same numbers; the others without points."""
+        is_member = (self.labels >= 0) & is_kept[self.labels] if self.n else np.zeros(len(self.labels), np.bool_)
+        return Groups(np.where(is_member, self.labels, -1), self.n)
 
     def members(self, group: int) -> Int64Array:
         """Indices of the points of one group, ascending."""
