@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from reference.boxes import least_rectangle_area, shared_volume
 
+from loda_pdal.kernels.boxes import drop_inner_points
 from loda_pdal.model.boxes import LEAST_SIZE_M, Boxes, box_iou, boxes_of, pca_boxes, upright_boxes
 
 
@@ -64,6 +65,28 @@ def test_the_upright_box_is_the_smallest_that_holds_all_points(seed: int, n: int
         area = box.size[0, 0] * box.size[0, 1]
         assert area <= least_rectangle_area(xyz[:, :2]) + 1e-9
         assert area >= 0.995 * least_rectangle_area(xyz[:, :2])
+
+
+@pytest.mark.parametrize(
+    ("shape", "least_share"), [("disc", 0.8), ("square", 0.8), ("wall", 0.4), ("corner", 0.0), ("twice", 0.0)]
+)
+def test_only_inner_points_are_dropped(shape: str, least_share: float) -> None:
+    rng = np.random.default_rng(7)
+    u, v = rng.uniform(-1, 1, (2, 3000))
+    plan = {
+        "disc": np.column_stack([u, v])[u**2 + v**2 < 1],
+        "square": np.column_stack([np.round(u, 1), np.round(v, 1)]),
+        "wall": np.column_stack([5 * u, 0.01 * v]),
+        "corner": np.column_stack([np.where(v > 0, u, -1), np.where(v > 0, -1, u)]),
+        "twice": np.repeat(np.column_stack([u, v])[:3], 2, axis=0),
+    }[shape]
+    xy = turned(np.column_stack([plan, np.zeros(len(plan))]), 31.0)[:, :2].copy()
+    label = np.zeros(len(xy), np.int32)
+    starts = np.array([0, len(xy)])
+    drop_inner_points(0, 1, xy, np.arange(len(xy), dtype=np.int32), starts, label)
+    assert np.mean(label < 0) >= least_share
+    hull = shapely.MultiPoint(xy).convex_hull
+    assert shapely.MultiPoint(xy[label == 0]).convex_hull.normalize() == hull.normalize()
 
 
 def test_groups_get_their_own_boxes_whatever_the_order() -> None:

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
+from loda_pdal.kernels.clusters import components
+from loda_pdal.kernels.rasters import highest_range
 from loda_pdal.model.cloud import FloatArray, IntArray, to_local_grid
 from loda_pdal.model.groups import Groups
 from loda_pdal.model.labels import ObjectClass
 from loda_pdal.params import FuseParams, Parameters
 from loda_pdal.stages.features import eigen_features
 from loda_pdal.stages.fuse import fuse_points
-from loda_pdal.stages.instances import Instances, dbscan, euclidean_clusters, form_instances, split_crowns
-from loda_pdal.stages.semantics import classify, fit_planes, merge, support_area, touching
+from loda_pdal.stages.instances import Instances, euclidean_clusters, form_instances, split_crowns
+from loda_pdal.stages.semantics import classify, fit_planes, split_at_edges, support_area, touching
 from loda_pdal.stages.superpoints import superpoints
 
 STREET = Parameters.preset("street")
@@ -115,20 +118,9 @@ def test_clusters_agree_with_all_pairs() -> None:
     reach = np.where(rng.random(400) < 0.2, rng.uniform(0.7, 1.5, 400), 0.7)
     gap = np.linalg.norm(xyz[:, None] - xyz[None], axis=2)
     links = np.argwhere(gap <= np.minimum(reach[:, None], reach[None]))
-    expected = merge(links, 400)
+    expected = components(links, 400)
     found = euclidean_clusters(xyz, 0.7, reach)
     assert len(set(zip(expected.tolist(), found.tolist(), strict=True))) == expected.max() + 1 == found.max() + 1
-
-
-def test_dbscan_counts_weights_and_gives_border_points_to_the_nearest_core() -> None:
-    x = np.array([0.0, 0.1, 0.2, 0.8, 5.0, 9.0])
-    points = np.column_stack([x, np.zeros(6), np.zeros(6)])
-    weight = np.array([1, 1, 1, 1, 1, 3], dtype=np.int32)
-    assert dbscan(points, weight, 0.7, 3).tolist() == [0, 0, 0, 0, -1, 1]
-    order = np.array([3, 5, 0, 4, 2, 1])
-    shuffled = dbscan(points[order], weight[order], 0.7, 3)
-    assert (shuffled == -1).tolist() == (dbscan(points, weight, 0.7, 3)[order] == -1).tolist()
-    assert len(set(shuffled[[0, 2, 4, 5]].tolist())) == 1
 
 
 def test_touching_crowns_are_two_trees_and_a_hedge_stays_whole() -> None:
@@ -166,4 +158,34 @@ def test_segments_that_touch_are_named_once() -> None:
     pairs, contact = touching(xyz, np.array([0, 0, 1, 1, -1, 2], np.int32), 0.3)
     assert pairs.tolist() == [[0, 1]]
     assert contact.tolist() == [2]
-    assert merge(np.array([[0, 2], [3, 4]]), 5).tolist() == [0, 1, 0, 2, 2]
+
+
+def test_only_a_superpoint_around_a_corner_is_split() -> None:
+    rng = np.random.default_rng(4)
+    wall = sheet(rng, np.array([0.3, 0, 0]), np.array([4.0, 0, 0]), np.array([0, 0, 3.0]))
+    gable = sheet(rng, np.array([0, 0.3, 0]), np.array([0, 4.0, 0]), np.array([0, 0, 3.0]))
+    far = sheet(rng, np.array([9.0, 0, 0]), np.array([4.0, 0, 0]), np.array([0, 0, 3.0]))
+    xyz = fuse_points(to_local_grid(np.concatenate([wall, gable, far])), FuseParams()).xyz
+    part = np.select([xyz[:, 0] > 8, xyz[:, 1] > 0.15], [2, 1], 0).astype(np.int32)
+    features = eigen_features(xyz, xyz[:, 2], STREET.features)
+    faces = np.array([[0, 1, 0], [1, 0, 0], [0, -1, 0]], dtype=np.float32)
+    features = replace(features, normals=faces[part])
+    superpoint = np.where(part == 2, 1, 0).astype(np.int32)
+    piece, n = split_at_edges(xyz, 0.25, features, superpoint, 2, STREET.semantics)
+    assert n == len(set(zip(part.tolist(), piece.tolist(), strict=True))) == 3
+
+
+def test_cells_climb_to_the_maximum_around_them() -> None:
+    rng = np.random.default_rng(5)
+    surface = rng.integers(0, 20, (9, 7)).astype(float)
+    for reach in (1, 3):
+        highest = np.empty(surface.shape, np.int64)
+        highest_range(0, 9, surface, reach, highest)
+        for i, j in np.ndindex(surface.shape):
+            window = [
+                (surface[a, b], -(a * 7 + b))
+                for a, b in np.ndindex(surface.shape)
+                if abs(a - i) <= reach and abs(b - j) <= reach
+            ]
+            best, at = max(window)
+            assert highest[i, j] == (i * 7 + j if surface[i, j] == best else -at)

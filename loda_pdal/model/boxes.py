@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from loda_pdal.kernels.boxes import shared_volumes, smallest_rectangles
+from loda_pdal.kernels.boxes import drop_inner_points, shared_volumes, smallest_rectangles
 from loda_pdal.kernels.parallel import run_ranges
 from loda_pdal.model.cloud import FloatArray
 from loda_pdal.model.groups import Groups
@@ -76,11 +76,14 @@ def upright_boxes(xyz: FloatArray, labels: npt.NDArray[Any], n: int) -> Boxes:
     several have the same area, that of least perimeter is taken.
     """
     groups = Groups(labels, n)
-    sorted_order = groups.order[np.lexsort((xyz[groups.order, 1], xyz[groups.order, 0], labels[groups.order]))]
     xy = np.ascontiguousarray(xyz[:, :2])
+    outer_label = labels.astype(np.int32)
+    run_ranges(drop_inner_points, n, xy, groups.order, groups.starts, outer_label, min_size=64)
+    outer = Groups(outer_label, n)
+    by_place = outer.order[np.lexsort((xy[outer.order, 1], xy[outer.order, 0], outer_label[outer.order]))]
     plan, along, rectangle = np.full((n, 2), np.nan), np.full((n, 2), np.nan), np.full((n, 2), np.nan)
-    run_ranges(smallest_rectangles, n, xy, sorted_order, groups.starts, plan, along, rectangle, min_size=64)
-    low, high = _extremes(groups, xyz[:, 2])
+    run_ranges(smallest_rectangles, n, xy, by_place, outer.starts, plan, along, rectangle, min_size=64)
+    low, high = groups.extremes(xyz[:, 2])
     size = np.column_stack([rectangle, high - low])
     axes = np.zeros((n, 3, 3))
     axes[:, 0, :2] = along
@@ -102,9 +105,8 @@ def pca_boxes(xyz: FloatArray, labels: npt.NDArray[Any], n: int) -> Boxes:
     axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
     owner = np.maximum(labels, 0)
     offset = xyz - mean[owner]
-    low, high = np.empty((n, 3)), np.empty((n, 3))
-    for axis in range(3):
-        low[:, axis], high[:, axis] = _extremes(groups, np.einsum("ij,ij->i", offset, axes[owner, axis]))
+    along = [np.einsum("ij,ij->i", offset, axes[owner, axis]) for axis in range(3)]
+    low, high = groups.extremes(np.column_stack(along))
     centre = mean + np.einsum("ij,ijk->ik", (low + high) / 2, axes)
     return Boxes(centre, axes, np.maximum(high - low, LEAST_SIZE_M))
 
@@ -134,14 +136,3 @@ def box_iou(a: Boxes, i: npt.NDArray[Any], b: Boxes, j: npt.NDArray[Any]) -> Flo
     run_ranges(shared_volumes, len(first), first, second, a.centre, a.axes, a.size, b.centre, b.axes, b.size, shared)
     union = a.volume[first] + b.volume[second] - shared
     return np.clip(np.divide(shared, union, out=np.zeros(len(first)), where=union > 0), 0.0, 1.0)
-
-
-def _extremes(groups: Groups, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Least and greatest of (m,) values per group; NaN for an empty group."""
-    low, high = np.full(groups.n, np.nan), np.full(groups.n, np.nan)
-    is_filled = groups.counts > 0
-    if is_filled.any():
-        starts = groups.starts[:-1][is_filled]
-        low[is_filled] = np.minimum.reduceat(values[groups.order], starts)
-        high[is_filled] = np.maximum.reduceat(values[groups.order], starts)
-    return low, high

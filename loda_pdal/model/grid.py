@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array
+from loda_pdal.kernels.lattice import find_range
+from loda_pdal.kernels.parallel import run_ranges
+from loda_pdal.model.cloud import FloatArray, Int64Array
 
 
 @dataclass(frozen=True)
@@ -24,9 +27,14 @@ class Lattice:
 
     @classmethod
     def around(cls, cells: Int64Array) -> Lattice:
-        """Lattice that holds the given cells (c, d) and their neighbours."""
-        low = cells.min(axis=0).astype(np.int64) - 1
-        return cls(low, cells.max(axis=0).astype(np.int64) - low + 2)
+        """Lattice that holds the given cells (c, d), at least one, and their neighbours."""
+        low = np.array([column.min() for column in cells.T], dtype=np.int64) - 1
+        return cls(low, np.array([column.max() for column in cells.T], dtype=np.int64) - low + 2)
+
+    @property
+    def has_keys(self) -> bool:
+        """Whether the keys of all its cells are integers of 64 bits."""
+        return bool(math.prod(self.span.tolist()) < 2**63)
 
     def keys(self, cells: Int64Array) -> Int64Array:
         """Key of each cell (k, d); only meaningful for cells inside."""
@@ -35,17 +43,20 @@ class Lattice:
             key = key * self.span[axis] + (cells[:, axis] - self.low[axis])
         return key
 
-    def contains(self, cells: Int64Array) -> BoolArray:
-        """Whether each cell (k, d) is inside, (k,) bool."""
-        return np.asarray(np.all((cells >= self.low) & (cells < self.low + self.span), axis=1))
+    def cells(self, keys: Int64Array) -> Int64Array:
+        """Cell (k, d) of each key."""
+        cells = np.empty((len(keys), len(self.low)), dtype=np.int64)
+        for axis in reversed(range(len(self.low))):
+            keys, along = np.divmod(keys, self.span[axis])
+            cells[:, axis] = along + self.low[axis]
+        return cells
 
     def find(self, sorted_keys: Int64Array, cells: Int64Array) -> Int64Array:
-        """Position of each cell (k, d) in ``sorted_keys``, -1 where it is not there."""
-        key = self.keys(cells)
-        position = np.minimum(np.searchsorted(sorted_keys, key), max(len(sorted_keys) - 1, 0))
-        if len(sorted_keys) == 0:
-            return np.full(len(cells), -1, dtype=np.int64)
-        return np.where(self.contains(cells) & (sorted_keys[position] == key), position, -1)
+        """Position of each cell (k, d) in ``sorted_keys``, distinct, -1 where it is not there."""
+        place = np.empty(len(cells), dtype=np.int64)
+        rows = np.ascontiguousarray(cells, dtype=np.int64)
+        run_ranges(find_range, len(rows), rows, self.low, self.span, np.ascontiguousarray(sorted_keys), place)
+        return place
 
 
 def cells_of(xyz: FloatArray, cell_m: float) -> Int64Array:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from loda_pdal.kernels.clusters import components
 from loda_pdal.kernels.neighbours import nearest
 from loda_pdal.model.cloud import ByteArray, FloatArray, IntArray
 from loda_pdal.model.groups import Groups
@@ -20,7 +21,6 @@ from loda_pdal.model.pair import Pair
 from loda_pdal.params import AssociationParams
 from loda_pdal.stages.association import Descriptors, Matches, associate
 from loda_pdal.stages.instances import Instances
-from loda_pdal.stages.semantics import merge
 
 _MIN_SHARED = 0.5  # an instance of which the other epoch shows at least this share joins the object that shows most
 
@@ -87,7 +87,7 @@ def match_instances(
         np.column_stack([only_before, votes.before.partner[only_before] + n_before]),
         np.column_stack([votes.after.partner[only_after], only_after + n_before]),
     ]
-    component = merge(np.concatenate(joins).astype(np.int64), n_before + len(instances.after))
+    component = components(np.concatenate(joins).astype(np.int64), n_before + len(instances.after))
     return _numbered(xyz, instances, component, pairs, votes)
 
 
@@ -129,10 +129,11 @@ def _pairs_by_proxy(instances: Pair[Instances], proxy: Pair[IntArray], matches: 
 def _largest_by_proxy_and_class(instances: Instances, proxy: IntArray) -> dict[tuple[int, int], int]:
     """Instance (0-based) with most voxels for each (proxy, class); ties: lowest."""
     is_member = (instances.instance > 0) & (proxy > 0)
-    rows = np.column_stack([proxy[is_member], instances.instance[is_member] - 1])
-    key, count = np.unique(rows, axis=0, return_counts=True)
+    key = proxy[is_member].astype(np.int64) * len(instances) + instances.instance[is_member] - 1
+    key, count = np.unique(key, return_counts=True)
     best: dict[tuple[int, int], tuple[int, int]] = {}
-    for (owner, index), n in zip(key.tolist(), count.tolist(), strict=True):
+    owner_of, index_of = np.divmod(key, max(len(instances), 1))
+    for owner, index, n in zip(owner_of.tolist(), index_of.tolist(), count.tolist(), strict=True):
         slot = (owner, int(instances.object_class[index]))
         if slot not in best or n > best[slot][0]:
             best[slot] = (n, index)
@@ -179,11 +180,10 @@ def _numbered(
     of_instance = Pair(component[:n_before], component[n_before:])
     rank = rank_by_place(xyz, instances.join(of_instance, owners), n)
     of_instance = of_instance.map(lambda side: rank[side])
-    votes_per_class = np.zeros((n, 256))
+    votes_per_class = np.zeros((n, 256), dtype=np.int64)
     for side, own in zip(of_instance, instances, strict=True):
-        is_member = own.instance > 0
-        index = own.instance[is_member] - 1
-        np.add.at(votes_per_class, (side[index], own.object_class[index]), 1)
+        voxels = np.bincount(own.instance, minlength=len(own) + 1)[1:]
+        np.add.at(votes_per_class, (side, own.object_class), voxels)
     priority = np.array(OBJECT_CLASSES, dtype=np.uint8)
     object_class = priority[np.argmax(votes_per_class[:, priority], axis=1)] if n else np.zeros(0, np.uint8)
     return Objects(of_instance, object_class, pairs, votes.map(lambda side: side.support))
@@ -197,11 +197,8 @@ def owners(instances: Instances, of_instance: IntArray) -> IntArray:
 
 def rank_by_place(xyz: Pair[FloatArray], owner: Pair[IntArray], n: int) -> IntArray:
     """Numbers (n,) for objects by their lowest corner over both epochs, x first, so that epochs may change places."""
-    low = np.full((n, 3), np.inf)
-    for points, side in zip(xyz, owner, strict=True):
-        groups = Groups(side, n)
-        for axis in range(3):
-            low[:, axis] = np.fmin(low[:, axis], groups.minimum(points[:, axis]))
+    before, after = xyz.join(owner, lambda points, side: Groups(side, n).minimum(points))
+    low = np.fmin(before, after)
     rank = np.empty(n, dtype=np.int32)
     rank[np.lexsort((low[:, 2], low[:, 1], low[:, 0]))] = np.arange(n, dtype=np.int32)
     return rank

@@ -6,17 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
-from loda_pdal.kernels.clusters import linked
-from loda_pdal.kernels.neighbours import count_neighbours, nearest, radius_neighbours
+from loda_pdal.kernels.clusters import components, count_some, dbscan, linked
+from loda_pdal.kernels.neighbours import nearest
+from loda_pdal.kernels.parallel import run_ranges
+from loda_pdal.kernels.rasters import highest_range
 from loda_pdal.model.boxes import upright_boxes
 from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, Int64Array, IntArray
 from loda_pdal.model.groups import Groups, consecutive
 from loda_pdal.model.labels import ObjectClass
 from loda_pdal.params import InstanceParams, SemanticParams
-from loda_pdal.stages.semantics import Semantics, fit_planes, merge, voxel_volume
+from loda_pdal.stages.semantics import Semantics, fit_planes, voxel_volume
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def _held_by_buildings(
     is_high = is_free & (np.nan_to_num(groups.quantile(height, 0.95)) > rules.building_top_m)
     a, b = semantics.adjacency[:, 0], semantics.adjacency[:, 1]
     is_linked = (is_building | is_high)[a] & (is_building | is_high)[b]
-    linked = merge(semantics.adjacency[is_linked], groups.n)
+    linked = components(semantics.adjacency[is_linked], groups.n)
     has_building = np.zeros(groups.n, np.bool_)
     has_building[linked[is_building]] = True
     is_held = is_building | (is_high & has_building[linked])
@@ -183,7 +183,7 @@ def _buildings_by_patches(xyz: FloatArray, n_raw: IntArray, semantics: Semantics
         is_parallel = np.abs(np.sum(planes.normal[a] * planes.normal[b], axis=1)) >= np.cos(
             np.radians(params.patch_angle_deg)
         )
-        building = merge(pairs[is_parallel & (boxes.footprint_overlap(a, b) > params.patch_iou)], n_patches)
+        building = components(pairs[is_parallel & (boxes.footprint_overlap(a, b) > params.patch_iou)], n_patches)
     points = groups.sum(n_raw)
     total = np.bincount(building, weights=points, minlength=n_patches)
     is_large = total[building] >= params.patch_min_points
@@ -285,7 +285,9 @@ def _vegetation(
         return label
     points = xyz[members]
     if params.is_density_adaptive:
-        density = count_neighbours(points, 1.0) / (4.0 / 3.0 * np.pi)
+        sphere_m3 = 4.0 / 3.0 * np.pi
+        dense = sphere_m3 * (params.cluster_density_factor / params.cluster_radius_m) ** 3  # more need no longer reach
+        density = count_some(points, 1.0, int(dense) + 1) / sphere_m3
         reach = np.maximum(params.cluster_radius_m, params.cluster_density_factor / np.cbrt(density))
         cluster = euclidean_clusters(points, params.cluster_radius_m, reach)
     else:
@@ -317,19 +319,12 @@ def split_crowns(xyz: FloatArray, height: FloatArray, cluster: IntArray, cell_m:
 
 def _uphill(surface: FloatArray, reach: int) -> Int64Array:
     """Flat index of the maximum that each cell of a raster climbs to, in steps of at most ``reach`` cells."""
-    best = surface.copy()
-    goal = np.arange(surface.size).reshape(surface.shape)
-    own = goal.copy()
-    for dx, dy in np.ndindex(2 * reach + 1, 2 * reach + 1):
-        step = (reach - dx, reach - dy)
-        value = np.roll(surface, step, axis=(0, 1))
-        is_higher = value > best
-        best = np.where(is_higher, value, best)
-        goal = np.where(is_higher, np.roll(own, step, axis=(0, 1)), goal)
-    flat = goal.ravel()
-    while not np.array_equal(flat[flat], flat):
-        flat = flat[flat]
-    return np.asarray(flat.reshape(surface.shape), dtype=np.int64)
+    highest = np.empty(surface.shape, dtype=np.int64)
+    run_ranges(highest_range, len(surface), np.ascontiguousarray(surface), reach, highest, min_size=64)
+    goal = highest.ravel()
+    while not np.array_equal(goal[goal], goal):
+        goal = goal[goal]
+    return goal.reshape(surface.shape)
 
 
 _CROWN_HEIGHT_M = 3.0
@@ -361,34 +356,8 @@ def _mobile(xyz: FloatArray, n_raw: IntArray, is_mobile: BoolArray, params: Inst
     members = np.flatnonzero(is_mobile)
     if len(members):
         plan = np.column_stack([xyz[members, :2], np.zeros(len(members))])
-        label[members] = dbscan(plan, n_raw[members], params.mobile_eps_m, params.mobile_min_points)
+        label[members] = consecutive(dbscan(plan, n_raw[members], params.mobile_eps_m, params.mobile_min_points))[0]
     return _without_small(label, params.mobile_min_voxels)
-
-
-def dbscan(xyz: FloatArray, weight: IntArray, eps_m: float, min_weight: int) -> IntArray:
-    """DBSCAN cluster of each point (m,), -1 noise; a core point has ``min_weight`` within ``eps_m``, itself included.
-
-    A border point joins the cluster of its nearest core point (ties: lowest index), so order does not matter.
-    """
-    starts, neighbour = radius_neighbours(xyz, eps_m)
-    source = np.repeat(np.arange(len(xyz)), np.diff(starts))
-    reached = np.bincount(source, weights=weight[neighbour], minlength=len(xyz))
-    if not (source == neighbour).any():
-        reached = reached + weight
-    is_core = reached >= min_weight
-    is_edge = is_core[source] & is_core[neighbour]
-    graph = coo_array((np.ones(is_edge.sum(), np.int8), (source[is_edge], neighbour[is_edge])), shape=(len(xyz),) * 2)
-    component = connected_components(graph, directed=False)[1]
-    cluster, _ = consecutive(np.where(is_core, component, -1))
-    is_border = ~is_core[source] & is_core[neighbour]
-    source, neighbour = source[is_border], neighbour[is_border]
-    distance = np.linalg.norm(xyz[source] - xyz[neighbour], axis=1)
-    order = np.lexsort((neighbour, distance, source))
-    source, neighbour = source[order], neighbour[order]
-    is_first = np.ones(len(source), np.bool_)
-    is_first[1:] = source[1:] != source[:-1]
-    cluster[source[is_first]] = cluster[neighbour[is_first]]
-    return cluster
 
 
 def _other(xyz: FloatArray, classification: ByteArray, is_taken: BoolArray, params: InstanceParams) -> IntArray:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from loda_pdal.kernels.clusters import components, smooth_pieces
+from loda_pdal.kernels.contacts import contact_keys
 from loda_pdal.kernels.neighbours import knn
 from loda_pdal.model.boxes import upright_boxes
 from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, Int64Array, IntArray
@@ -52,8 +52,6 @@ class Semantics:
         Pairs of segments that touch, first smaller than second.
     contact : (e,) int64
         In how many neighbour relations of voxels they touch.
-    planes : Planes
-        Plane of each segment.
     """
 
     classification: ByteArray
@@ -61,7 +59,6 @@ class Semantics:
     plane_group: IntArray
     adjacency: Int64Array
     contact: Int64Array
-    planes: Planes
 
 
 def classify(
@@ -94,23 +91,19 @@ def classify(
         superpoint, n_superpoints = split_at_edges(xyz, leaf_m, features, superpoint, n_superpoints, params)
     groups = Groups(superpoint, n_superpoints)
     height = groups.median(values[:, _HEIGHT])
-    planes = fit_planes(xyz, groups)
     adjacency, contact = touching(xyz, superpoint, 2.5 * leaf_m)
 
-    is_ground = _ground(groups, values, height, params)
-    is_planar = (
-        ~is_ground
-        & (groups.median(values[:, _PLANARITY]) > params.building_planarity)
-        & (planes.rmse < params.building_rmse_m)
-    )
+    is_ground = _ground(groups, values, params)
+    is_planar = ~is_ground & (groups.median(values[:, _PLANARITY]) > params.building_planarity)
+    planes = fit_planes(xyz, groups.only(is_planar))
+    is_planar &= planes.rmse < params.building_rmse_m
     plane_group = _coplanar(planes, is_planar, adjacency, params.merge_angle_deg, 2 * params.building_rmse_m)
     is_building = _building(xyz, leaf_m, groups, values[:, _HEIGHT], height, planes, plane_group, params)
-    is_vegetation = (
-        (groups.median(values[:, _SPHERICITY]) > params.vegetation_sphericity)
-        & (height > params.vegetation_height_m)
-        & (_azimuth_spread(features.normals, groups) > np.radians(params.vegetation_azimuth_deg))
-    )
-    is_mobile = _mobile(xyz, superpoint, n_superpoints, params)
+    is_round = groups.median(values[:, _SPHERICITY]) > params.vegetation_sphericity
+    is_vegetation = is_round & (height > params.vegetation_height_m) & ~(is_ground | is_building)
+    azimuth_spread = _azimuth_spread(features.normals, groups.only(is_vegetation))
+    is_vegetation &= azimuth_spread > np.radians(params.vegetation_azimuth_deg)
+    is_mobile = _mobile(xyz, groups.only(~(is_ground | is_building | is_vegetation)), params)
 
     rules = (is_ground, is_building, is_vegetation, is_mobile)
     codes = (ObjectClass.GROUND, ObjectClass.BUILDING, ObjectClass.VEGETATION, ObjectClass.MOBILE)
@@ -119,7 +112,7 @@ def classify(
     if params.points_near_ground_are_ground:
         is_low = np.abs(values[:, _HEIGHT]) < params.ground_distance_m
         classification = np.where(is_low, np.uint8(ObjectClass.GROUND), classification)
-    return Semantics(classification, superpoint, plane_group, adjacency, contact, planes)
+    return Semantics(classification, superpoint, plane_group, adjacency, contact)
 
 
 def split_at_edges(
@@ -137,20 +130,14 @@ def split_at_edges(
     differ by more than ``split_angle_deg``.
     """
     groups = Groups(superpoint, n_superpoints)
-    is_bent = (groups.median(features.values[:, _PLANARITY]) > 0.8 * params.building_planarity) & (
-        fit_planes(xyz, groups).rmse >= params.building_rmse_m
-    )
+    is_bent = groups.median(features.values[:, _PLANARITY]) > 0.8 * params.building_planarity
+    is_bent &= fit_planes(xyz, groups.only(is_bent)).rmse >= params.building_rmse_m
     members = np.flatnonzero(is_bent[superpoint]) if n_superpoints else np.zeros(0, np.int64)
     if len(members) == 0:
         return superpoint, n_superpoints
     neighbour, _ = knn(xyz[members], 9, 2.5 * leaf_m)
-    source = np.repeat(np.arange(len(members)), neighbour.shape[1])
-    target = neighbour.ravel()
-    source, target = source[target >= 0], target[target >= 0]
-    normals = features.normals[members].astype(np.float64)
-    is_smooth = np.abs(np.sum(normals[source] * normals[target], axis=1)) > np.cos(np.radians(params.split_angle_deg))
-    is_kept = is_smooth & (superpoint[members][source] == superpoint[members][target])
-    piece = merge(np.column_stack([source, target])[is_kept], len(members))
+    least_cosine = np.cos(np.radians(params.split_angle_deg))
+    piece = smooth_pieces(neighbour, features.normals[members], superpoint[members], least_cosine)
     label = superpoint.astype(np.int64)
     label[members] = n_superpoints + piece
     return consecutive(label)
@@ -169,24 +156,12 @@ def touching(xyz: FloatArray, labels: IntArray, reach_m: float) -> tuple[Int64Ar
     if len(xyz) == 0:
         return np.zeros((0, 2), np.int64), np.zeros(0, np.int64)
     neighbour, _ = knn(xyz, 9, reach_m)
-    first = np.repeat(labels.astype(np.int64), neighbour.shape[1])
-    flat = neighbour.ravel()
-    is_edge = (flat >= 0) & (first >= 0)
-    first, second = first[is_edge], labels[flat[is_edge]].astype(np.int64)
-    is_edge = (first != second) & (second >= 0)
-    low, high = np.minimum(first, second)[is_edge], np.maximum(first, second)[is_edge]
-    key, contact = np.unique(low * (int(labels.max()) + 1) + high, return_counts=True)
-    pairs = np.column_stack(np.divmod(key, int(labels.max()) + 1)) if len(key) else np.zeros((0, 2), np.int64)
-    return pairs, contact.astype(np.int64)
+    n = int(labels.max()) + 1
+    key, contact = np.unique(contact_keys(neighbour, labels, n), return_counts=True)
+    return np.column_stack(np.divmod(key, max(n, 1))), contact.astype(np.int64)
 
 
-def merge(pairs: Int64Array, n: int) -> IntArray:
-    """Connected components of ``n`` nodes under the pairs (e, 2), numbered by their lowest node."""
-    graph = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int32)
-
-
-def _ground(groups: Groups, values: np.ndarray, height: FloatArray, params: SemanticParams) -> BoolArray:
+def _ground(groups: Groups, values: np.ndarray, params: SemanticParams) -> BoolArray:
     distance = groups.median(np.abs(values[:, _HEIGHT]))
     is_horizontal = groups.share(values[:, _VERTICAL] > params.ground_horizontal) >= params.ground_share
     return np.asarray((distance < params.ground_distance_m) & is_horizontal)
@@ -203,7 +178,7 @@ def _coplanar(
         np.abs(np.sum(planes.normal[a] * offset, axis=1)), np.abs(np.sum(planes.normal[b] * offset, axis=1))
     )
     is_merged = is_planar[a] & is_planar[b] & is_parallel & (gap < distance_m)
-    return np.where(is_planar, merge(adjacency[is_merged], len(is_planar)), -1).astype(np.int32)
+    return np.where(is_planar, components(adjacency[is_merged], len(is_planar)), -1).astype(np.int32)
 
 
 def _building(
@@ -219,8 +194,7 @@ def _building(
     """Superpoints in large enough facade planes, and in roof planes where the preset has roofs."""
     if not (plane_group >= 0).any():
         return np.zeros(len(plane_group), np.bool_)
-    point_group = np.where(groups.labels >= 0, plane_group[np.maximum(groups.labels, 0)], -1)
-    merged = Groups(point_group, len(plane_group))
+    merged = Groups(plane_group[groups.labels], groups.n)
     area = support_area(xyz, merged, fit_planes(xyz, merged), 2 * leaf_m)[np.maximum(plane_group, 0)]
     top = np.nan_to_num(merged.quantile(point_height, 0.95))[np.maximum(plane_group, 0)]
     is_vertical = np.abs(planes.normal[:, 2]) < params.building_vertical
@@ -244,22 +218,26 @@ def support_area(xyz: FloatArray, groups: Groups, planes: Planes, cell_m: float)
 
 def _azimuth_spread(normals: np.ndarray, groups: Groups) -> FloatArray:
     """Spread of normal azimuths per superpoint, rad: 5th to 95th percentile of the axis angle about its mean axis."""
-    doubled = 2.0 * np.arctan2(normals[:, 1].astype(np.float64), normals[:, 0].astype(np.float64))
-    has_azimuth = np.hypot(normals[:, 0], normals[:, 1]) > 0.05
+    east, north = (normals[groups.order, axis] for axis in (0, 1))
+    doubled = 2.0 * np.arctan2(north.astype(np.float64), east.astype(np.float64))
+    has_azimuth = np.hypot(east, north) > 0.05
+    sorted_groups = Groups(groups.labels[groups.order], groups.n)
     mean = np.arctan2(
-        groups.sum(np.where(has_azimuth, np.sin(doubled), 0)), groups.sum(np.where(has_azimuth, np.cos(doubled), 0))
+        sorted_groups.sum(np.where(has_azimuth, np.sin(doubled), 0)),
+        sorted_groups.sum(np.where(has_azimuth, np.cos(doubled), 0)),
     )
-    about = doubled - mean[np.maximum(groups.labels, 0)]
+    about = doubled - np.repeat(mean, groups.counts)
     wrapped = np.where(has_azimuth, np.arctan2(np.sin(about), np.cos(about)) / 2.0, np.nan)
-    return np.nan_to_num(groups.quantile(wrapped, 0.95) - groups.quantile(wrapped, 0.05))
+    return np.nan_to_num(sorted_groups.quantile(wrapped, 0.95) - sorted_groups.quantile(wrapped, 0.05))
 
 
-def _mobile(xyz: FloatArray, superpoint: IntArray, n_superpoints: int, params: SemanticParams) -> BoolArray:
+def _mobile(xyz: FloatArray, groups: Groups, params: SemanticParams) -> BoolArray:
     """Superpoints that fit into a vehicle's box."""
-    size = upright_boxes(xyz, superpoint, n_superpoints).size
+    size = upright_boxes(xyz, groups.labels, groups.n).size
     length, width, height = np.maximum(size[:, 0], size[:, 1]), np.minimum(size[:, 0], size[:, 1]), size[:, 2]
     fits = (length < params.mobile_length_m) & (width < params.mobile_width_m) & (height < params.mobile_height_m)
-    return np.asarray(fits & (voxel_volume(xyz, superpoint, n_superpoints, 0.5) < params.mobile_volume_m3))
+    volume = voxel_volume(xyz, groups.only(fits).labels, groups.n, 0.5)
+    return np.asarray(fits & (volume < params.mobile_volume_m3))
 
 
 def voxel_volume(xyz: FloatArray, labels: IntArray, n: int, voxel_m: float) -> FloatArray:
