@@ -77,7 +77,8 @@ def draw_points(
     """
     nearest, colour = np.full(view.shape, NOTHING), np.zeros(view.shape, dtype=np.float32)
     dot = _dot(min(24, max(1, math.ceil(point_m / view.pixel_m))))
-    splat(*map(np.ascontiguousarray, points), tone, view.u0, view.v0, view.pixel_m, dot, nearest, colour)
+    corner = float(view.u0), float(view.v0)
+    splat(*map(np.ascontiguousarray, (*points, tone)), *corner, float(view.pixel_m), dot, nearest, colour)
     shade(nearest, colour, 1 + ramp * RAMP, RAMP, picture)
 
 
