@@ -154,7 +154,7 @@ def ground_records(ground_changes: GroundChanges, T_after_frame: FloatArray) -> 
 def outline_of(xyz_after_frame: Pair[FloatArray]) -> shapely.Polygon:
     """Convex hull of both epochs in plan: the extent processed."""
     plan = np.concatenate([side[:, :2] for side in xyz_after_frame])
-    hull = shapely.convex_hull(shapely.MultiPoint(plan))
+    hull = shapely.convex_hull(shapely.linestrings(plan) if len(plan) > 1 else shapely.MultiPoint(plan))
     return hull if isinstance(hull, shapely.Polygon) else hull.buffer(0.5)
 
 
@@ -199,9 +199,10 @@ def _most_common(group: IntArray, value: IntArray, n: int) -> IntArray:
     is_in = (group >= 0) & (value > 0)
     result = np.zeros(n, dtype=np.int32)
     if is_in.any():
-        rows, count = np.unique(np.column_stack([group[is_in], value[is_in]]), axis=0, return_counts=True)
-        order = np.lexsort((-rows[:, 1], count))  # the last written wins: most common, then lowest
-        result[rows[order, 0]] = rows[order, 1]
+        base = int(value.max()) + 1
+        key, count = np.unique(group[is_in].astype(np.int64) * base + value[is_in], return_counts=True)
+        order = np.lexsort((-key, count))  # the last written wins: most common, then lowest
+        result[key[order] // base] = key[order] % base
     return result
 
 

@@ -1,4 +1,4 @@
-"""Imports point one way: kernels and model <- stages <- pipeline <- faces; io sees the model and its parameters."""
+"""Imports point one way: kernels and model <- stages <- pipeline <- faces; io sees what lies below the stages."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MAY_IMPORT = {
     "params": {"model"},
     "kernels": {"kernels", "model"},
     "stages": {"stages", "kernels", "model", "params"},
-    "io": {"io", "model", "params"},
+    "io": {"io", "kernels", "model", "params"},
     "assembly": {"stages", "model"},
     "pipeline": {"assembly", "stages", "kernels", "model", "params"},
     "pdal_face": {"pdal_face", "pipeline", "assembly", "stages", "kernels", "io", "model", "params"},

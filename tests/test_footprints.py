@@ -7,8 +7,10 @@ import pytest
 import shapely
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import ndimage
 
-from loda_pdal.stages.footprints import footprints
+from loda_pdal.model.cloud import Int64Array
+from loda_pdal.stages.footprints import _Rasters, footprints
 
 
 def _placed(points: np.ndarray, angle: float) -> np.ndarray:
@@ -101,3 +103,33 @@ def test_any_scatter_gives_a_valid_right_handed_outline(seed: int, n: int, exten
     assert all(not hole.is_ccw for part in outline.geoms for hole in part.interiors)
     distance = shapely.distance(outline, shapely.points(points))
     assert distance.max() < 1.0
+
+
+def _scattered_cells(seed: int) -> tuple[Int64Array, Int64Array]:
+    """Cells of objects 0, 1 and 3 of four: thin enough for gaps, and for corners that touch."""
+    rng = np.random.default_rng(seed)
+    number = np.repeat(np.array([0, 1, 3]), [40, 1, 300])
+    return number, np.vstack([rng.integers(-9, 3, (40, 2)), [[5, -7]], rng.integers(0, 40, (300, 2))])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_gaps_are_closed_as_by_morphology_and_every_covered_cell_is_in_the_area(seed: int) -> None:
+    number, cells = _scattered_cells(seed)
+    closed = _Rasters.of(number, cells, 4).closed()
+    for o, area in enumerate(closed.areas()):
+        raster = np.zeros((80, 80), np.bool_)
+        raster[tuple((cells[number == o] + 20).T)] = True
+        expected = ndimage.binary_closing(raster, np.ones((3, 3)))
+        is_own = closed.raster == o
+        x, y = np.divmod(closed.element[is_own] - closed.start[o], max(closed.shape[o, 1], 1))
+        assert np.array_equal(np.column_stack([x, y]) + closed.first[o], np.argwhere(expected) - 20)
+        centres = np.argwhere(np.ones_like(raster)) - 20 + 0.5
+        assert np.array_equal(shapely.contains_xy(area, *centres.T), expected.ravel())
+
+
+def test_an_outline_does_not_depend_on_the_other_objects() -> None:
+    number, cells = _scattered_cells(5)
+    together = footprints(cells + 0.5, number + 1, 4, 1.0)
+    for o, outline in enumerate(together):
+        (alone,) = footprints(cells[number == o] + 0.5, np.ones(np.count_nonzero(number == o), np.int32), 1, 1.0)
+        assert shapely.to_wkb(alone) == shapely.to_wkb(outline)

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from loda_pdal.io import report, report_folder, report_pictures
 from loda_pdal.io.colours import LABEL_COLOURS, rgb
 from loda_pdal.io.outputs import write_outputs
-from loda_pdal.io.pictures import RAMP, PlanIndex, View, compose, draw_points, palette, png
+from loda_pdal.io.pictures import RAMP, PlanIndex, View, draw_points, palette, png
 from loda_pdal.io.report import MEANINGS, ranked, render, write_report
 from loda_pdal.io.report_folder import read_report_data, rebuild_report
 from loda_pdal.io.report_pictures import Scene, object_pictures, round_length
@@ -198,34 +198,75 @@ def test_png_checksums_are_right() -> None:
         body = body[12 + length :]
 
 
-def test_nearest_point_is_seen_as_a_slow_twin_finds_it() -> None:
+def blank(view: View) -> np.ndarray:
+    return np.zeros(view.shape, dtype=np.uint8)
+
+
+def slowly_drawn(view: View, points: np.ndarray, tone: np.ndarray, point_m: float) -> np.ndarray:
+    """Shades 0 to `RAMP` - 1 of the nearest dots, pixel by pixel; -1 where there is none."""
+    size = max(1, int(np.ceil(point_m / view.pixel_m)))
+    nearest, colour = np.full(view.shape, -1e6), np.zeros(view.shape)
+    for (u, v, depth), light in zip(points, tone, strict=True):
+        row = view.shape[0] - 1 - int(np.floor((v - view.v0) / view.pixel_m)) - size // 2
+        column = int(np.floor((u - view.u0) / view.pixel_m)) - size // 2
+        for i, j in np.ndindex(size, size):
+            pixel = row + i, column + j
+            is_in_dot = np.hypot(i - (size - 1) / 2, j - (size - 1) / 2) <= size / 2
+            if is_in_dot and min(pixel) >= 0 and np.all(np.less(pixel, view.shape)) and depth > nearest[pixel]:
+                nearest[pixel], colour[pixel] = depth, light
+    shades = np.full(view.shape, -1)
+    for i, j in np.argwhere(nearest > -1e6):
+        hidden = 0.0
+        for reach in (1, 3):
+            for di, dj in ((-1, 0), (0, -1), (0, 1), (1, 0), (-1, -1)):
+                a, b = i + di * reach, j + dj * reach
+                if 0 <= a < view.shape[0] and 0 <= b < view.shape[1]:
+                    hidden += min(max(nearest[a, b] - nearest[i, j], 0.0), 1.5)
+        shades[i, j] = int(colour[i, j] * np.exp(-0.16 * hidden) * (RAMP - 1))
+    return shades
+
+
+@pytest.mark.parametrize("point_m", [0.2, 0.5, 1.0, 1.3])
+@pytest.mark.parametrize("ramp", [0, 1])
+def test_dots_and_their_shade_are_as_a_slow_twin_draws_them(point_m: float, ramp: int) -> None:
     rng = np.random.default_rng(3)
-    u, v, depth, tone = rng.uniform(-1, 11, 3000), rng.uniform(-1, 9, 3000), rng.uniform(0, 5, 3000), rng.random(3000)
-    view = View(0.0, 0.0, 10.0, 8.0, 1.0)
-    brightness, is_drawn = draw_points(view, u, v, depth, tone, point_m=0.5)
-    expected = np.full(view.shape, np.nan)
-    nearest = np.full(view.shape, -np.inf)
-    for i in range(3000):
-        row, column = 7 - int(np.floor(v[i])), int(np.floor(u[i]))
-        if 0 <= row < 8 and 0 <= column < 10 and depth[i] > nearest[row, column]:
-            nearest[row, column], expected[row, column] = depth[i], tone[i]
-    assert np.array_equal(is_drawn, np.isfinite(expected))
-    assert np.all(brightness[is_drawn] <= expected[is_drawn] + 1e-6)  # shading only darkens
-    flat, _ = draw_points(view, u, v, np.zeros(3000), np.ones(3000), point_m=0.5)
-    assert np.all(flat[is_drawn] == 1.0)  # a level surface has no edges to shade
+    points, tone = rng.uniform((-1, -1, 0), (11, 9, 3), (400, 3)), rng.random(400)
+    view = View(0.0, 0.0, 10.0, 8.0, 0.2)
+    picture = blank(view)
+    draw_points(picture, view, tuple(points.T), tone, point_m, ramp)
+    expected = slowly_drawn(view, points, tone, point_m)
+    assert np.array_equal(picture > 0, expected >= 0)
+    is_drawn = picture > 0
+    difference = np.abs(picture[is_drawn] - 1.0 - ramp * RAMP - expected[is_drawn])
+    assert difference.max() <= 1 and np.mean(difference > 0) < 0.001  # float32 may fall to either side of a step
 
 
-def test_shading_darkens_the_foot_of_a_step() -> None:
+def test_pictures_do_not_depend_on_the_order_of_the_points() -> None:
+    rng = np.random.default_rng(5)
+    points, tone = rng.uniform(0, 10, (500, 3)).round(), rng.random(500)  # many are equally near
+    view = View(0.0, 0.0, 10.0, 10.0, 0.1)
+    first, second = blank(view), blank(view)
+    draw_points(first, view, tuple(points.T), tone, 0.5, 0)
+    draw_points(second, view, tuple(points[::-1].T), tone[::-1], 0.5, 0)
+    assert np.array_equal(first, second)
+
+
+def test_shading_darkens_the_foot_of_a_step_and_no_level_surface() -> None:
     low, high = grid(0, 0, 10, 5, 0.0, 0.5), grid(0, 5, 10, 10, 3.0, 0.5)
     points = np.vstack([low, high])
-    brightness, _ = draw_points(View(0, 0, 10, 10, 0.5), *points.T, np.ones(len(points)), point_m=0.4)
-    assert brightness[11, 10] < 0.95 and brightness[4, 10] == 1.0 and brightness[18, 10] == 1.0
+    view = View(0, 0, 10, 10, 0.5)
+    picture = blank(view)
+    draw_points(picture, view, tuple(points.T), np.ones(len(points)), point_m=0.4, ramp=0)
+    assert picture[11, 10] < 0.95 * RAMP and picture[4, 10] == picture[18, 10] == RAMP
 
 
-def test_layers_lie_over_one_another() -> None:
-    full, corner = np.ones((2, 2), dtype=bool), np.array([[True, False], [False, False]])
-    picture = compose((2, 2), (np.zeros((2, 2)), full, 0), (np.ones((2, 2)), corner, 1))
-    assert picture.tolist() == [[2 * RAMP, 1], [1, 1]]
+def test_what_is_drawn_later_lies_on_top() -> None:
+    view, one = View(0, 0, 2, 2, 1.0), np.ones(1)
+    picture = blank(view)
+    for x, y in ((0.5, 0.5), (1.5, 0.5), (0.5, 1.5)):
+        draw_points(picture, view, (x * one, y * one, 9.0 * one), 0.0 * one, 1.0, ramp=0)
+    draw_points(picture, view, (0.5 * one, 1.5 * one, 0.0 * one), one, 1.0, ramp=1)
+    assert picture.tolist() == [[2 * RAMP, 0], [1, 1]]
 
 
 def test_plan_index_finds_what_a_look_at_all_points_finds() -> None:

@@ -1,4 +1,4 @@
-"""Pictures of points for the report: a depth buffer, soft shading, and a PNG of 256 colours; NumPy only."""
+"""Pictures of points for the report: a depth buffer, soft shading, and a PNG of 256 colours."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ import numpy as np
 import numpy.typing as npt
 
 from loda_pdal.io.colours import rgb
-from loda_pdal.model.cloud import BoolArray, ByteArray, Float32Array, FloatArray, Int64Array
+from loda_pdal.kernels.splat import NOTHING, shade, splat
+from loda_pdal.model.cloud import ByteArray, FloatArray, Int64Array
+
+IndexArray = npt.NDArray[np.intp]
 
 RAMP = 32
 """Shades per ramp of a picture's palette."""
 
 PAPER = (250, 250, 248)
-_NOTHING = np.float32(-1e6)
-"""Depth where no point is drawn, m."""
 _CONTEXT_RAMP = ((52, 58, 66), (226, 228, 230))
 
 
@@ -50,78 +51,43 @@ def palette(colour: str) -> ByteArray:
 
 
 def draw_points(
-    view: View, u: FloatArray, v: FloatArray, depth: FloatArray, tone: FloatArray, point_m: float
-) -> tuple[FloatArray, BoolArray]:
-    """Brightness of the nearest points in a view, shaded so that edges in depth stand out.
+    picture: ByteArray,
+    view: View,
+    points: tuple[FloatArray, FloatArray, FloatArray],
+    tone: FloatArray,
+    point_m: float,
+    ramp: int,
+) -> None:
+    """Draw points over a picture, those nearest to the viewer on top, shaded so that edges in depth stand out.
 
     Parameters
     ----------
+    picture : (rows, columns) uint8
+        Palette indices; changed where there is a point. A picture of zeros is blank.
     view : View
         What is drawn.
-    u, v : (n,) float64, m
-        Position of each point in the plane of the picture.
-    depth : (n,) float64, m
-        How near each point is to the viewer; the largest is seen.
+    points : u, v, depth, each (n,) float64, m
+        Place of each point in the plane of the picture, and how near it is to the viewer.
     tone : (n,) float64
         Brightness of each point before shading, 0 to 1.
     point_m : float
         Diameter of the dot drawn for a point, m.
-
-    Returns
-    -------
-    brightness : (rows, columns) float64
-        0 to 1.
-    is_drawn : (rows, columns) bool
-        Where there is a point at all.
+    ramp : int
+        0 for the grey ramp of the palette, 1 for the coloured one.
     """
-    size = min(24, max(1, math.ceil(point_m / view.pixel_m)))
-    rows, columns = view.shape
-    stride = columns + 2 * size  # a margin around the picture, where dots may end without being looked after
-    column = np.floor((u - view.u0) / view.pixel_m) + size
-    row = rows - 1 - np.floor((v - view.v0) / view.pixel_m) + size
-    reach = size // 2 + 1
-    is_near = (row >= reach) & (row < rows + 2 * size - reach) & (column >= reach) & (column < stride - reach)
-    order = np.flatnonzero(is_near)[np.argsort(depth[is_near], kind="stable")]
-    base = row[order].astype(np.int64) * stride + column[order].astype(np.int64)
-    depth, tone = depth[order].astype(np.float32), tone[order].astype(np.float32)
-    nearest = np.full((rows + 2 * size) * stride, _NOTHING)
-    colour = np.zeros(len(nearest), dtype=np.float32)
-    for i, j in _disc(size):
-        pixel = base + ((i - size // 2) * stride + j - size // 2)
-        is_nearer = depth >= nearest[pixel]
-        pixel = pixel[is_nearer]
-        nearest[pixel] = depth[is_nearer]  # sorted by depth: of equal pixels the nearest comes last
-        colour[pixel] = tone[is_nearer]
-    inside = np.s_[size : size + rows, size : size + columns]
-    nearest, colour = (values.reshape(-1, stride)[inside] for values in (nearest, colour))
-    return (colour * _eye_dome(nearest)).astype(np.float64), nearest > _NOTHING
+    nearest, colour = np.full(view.shape, NOTHING), np.zeros(view.shape, dtype=np.float32)
+    dot = _dot(min(24, max(1, math.ceil(point_m / view.pixel_m))))
+    corner = float(view.u0), float(view.v0)
+    splat(*map(np.ascontiguousarray, (*points, tone)), *corner, float(view.pixel_m), dot, nearest, colour)
+    shade(nearest, colour, 1 + ramp * RAMP, RAMP, picture)
 
 
-def _disc(size: int) -> list[tuple[int, int]]:
-    """Pixels (row, column) of a dot of ``size`` pixels across."""
-    middle, radius = (size - 1) / 2, size / 2
-    return [(i, j) for i, j in np.ndindex(size, size) if math.hypot(i - middle, j - middle) <= radius]
-
-
-def _eye_dome(nearest: Float32Array) -> Float32Array:
-    """Shade (rows, columns) 0 to 1: darker where neighbours stand nearer to the viewer (eye-dome lighting)."""
-    rows, columns = nearest.shape
-    hidden = np.zeros_like(nearest)
-    for reach in (1, 3):
-        padded = np.pad(nearest, reach, constant_values=_NOTHING)
-        for di, dj in ((0, 1), (1, 0), (1, 2), (2, 1), (0, 0)):  # upper left twice: light comes from there
-            i, j = di * reach, dj * reach
-            hidden += np.clip(padded[i : i + rows, j : j + columns] - nearest, 0.0, 1.5)
-    return np.asarray(np.exp(-0.16 * hidden))
-
-
-def compose(shape: tuple[int, int], *layers: tuple[FloatArray, BoolArray, int]) -> ByteArray:
-    """Palette indices (rows, columns): each layer (brightness, is_drawn, ramp 0 or 1) over the one before."""
-    picture: ByteArray = np.zeros(shape, dtype=np.uint8)
-    for brightness, is_drawn, ramp in layers:
-        shade = 1 + ramp * RAMP + np.clip(brightness * (RAMP - 1), 0, RAMP - 1).astype(np.uint8)
-        picture[is_drawn] = shade[is_drawn]
-    return picture
+def _dot(size: int) -> Int64Array:
+    """Rows (d, 3) of a dot of ``size`` pixels across: row, first and last column about the pixel of its point."""
+    offset = np.arange(size) - (size - 1) / 2
+    is_inside = np.hypot(offset[:, None], offset) <= size / 2
+    first, last = np.argmax(is_inside, axis=1), size - 1 - np.argmax(is_inside[:, ::-1], axis=1)
+    return np.column_stack([np.arange(size), first, last]) - size // 2
 
 
 def png_data_uri(picture: ByteArray, colours: ByteArray) -> str:
@@ -135,7 +101,7 @@ def png(picture: ByteArray, colours: ByteArray) -> bytes:
     lines = np.zeros((rows, columns + 1), dtype=np.uint8)
     lines[:, 1:] = picture
     header = struct.pack(">IIBBBBB", columns, rows, 8, 3, 0, 0, 0)
-    chunks = ((b"IHDR", header), (b"PLTE", colours.tobytes()), (b"IDAT", zlib.compress(lines.tobytes(), 6)))
+    chunks = ((b"IHDR", header), (b"PLTE", colours.tobytes()), (b"IDAT", zlib.compress(lines.data, 4)))
     body = b"".join(_chunk(kind, data) for kind, data in (*chunks, (b"IEND", b"")))
     return b"\x89PNG\r\n\x1a\n" + body
 
@@ -161,10 +127,10 @@ class PlanIndex:
         self.low: Int64Array = cells.min(axis=0) if len(cells) else np.zeros(2, dtype=np.int64)
         self.n_cells: Int64Array = cells.max(axis=0) - self.low + 1 if len(cells) else np.zeros(2, dtype=np.int64)
         keys = (cells[:, 0] - self.low[0]) * self.n_cells[1] + cells[:, 1] - self.low[1]
-        self.order: npt.NDArray[np.intp] = np.argsort(keys, kind="stable")
+        self.order: IndexArray = np.argsort(keys, kind="stable")
         self.keys: Int64Array = keys[self.order]
 
-    def near(self, x0: float, y0: float, x1: float, y1: float) -> npt.NDArray[np.intp]:
+    def near(self, x0: float, y0: float, x1: float, y1: float) -> IndexArray:
         """Indices of the points in all cells that the rectangle touches, ascending."""
         first = np.maximum(np.floor(np.array([x0, y0]) / self.cell_m).astype(np.int64) - self.low, 0)
         last = np.minimum(np.floor(np.array([x1, y1]) / self.cell_m).astype(np.int64) - self.low, self.n_cells - 1)

@@ -13,11 +13,12 @@ from dataclasses import dataclass, field
 from datetime import date
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from loda_pdal.io.colours import LABEL_COLOURS
 from loda_pdal.io.report_pictures import Scene, Shape, ground_pictures, map_svg, object_pictures
 from loda_pdal.io.summary import is_changed, summarise
+from loda_pdal.kernels.parallel import run_ranges
 from loda_pdal.model.cloud import FloatArray
 from loda_pdal.model.frame import LocalFrame
 from loda_pdal.model.labels import OBJECT_CLASSES, ChangeLabel, ObjectClass
@@ -25,6 +26,8 @@ from loda_pdal.model.pair import Pair
 from loda_pdal.model.records import ChangeResult, GroundChangeRecord, ObjectRecord, UIntArray
 from loda_pdal.model.survey import Survey
 from loda_pdal.params import Parameters
+
+T = TypeVar("T")
 
 MAX_PICTURED = 150
 """Changed objects shown with pictures, at 50 to 100 kB each; the table lists more."""
@@ -435,7 +438,18 @@ def _cards(pictured: list[ObjectRecord], n_changes: int, scene: Scene, data: Rep
         if len(pictured) < n_changes
         else ""
     )
-    return f"<h2>Change by change</h2>{some}{HOW_TO_READ}" + "".join(_card(record, scene, data) for record in pictured)
+    return f"<h2>Change by change</h2>{some}{HOW_TO_READ}" + _drawn(lambda record: _card(record, scene, data), pictured)
+
+
+def _drawn(card: Callable[[T], str], records: Sequence[T]) -> str:
+    """The cards of all records in their order; pictures are drawn and packed on all threads."""
+    cards = [""] * len(records)
+
+    def fill(start: int, stop: int) -> None:
+        cards[start:stop] = map(card, records[start:stop])
+
+    run_ranges(fill, len(records), min_size=1)
+    return "".join(cards)
 
 
 def _card(record: ObjectRecord, scene: Scene, data: ReportData) -> str:
@@ -497,23 +511,25 @@ def _ground(records: list[GroundChangeRecord], n_all: int, scene: Scene, frame: 
     if not records:
         return ""
     some = f'<p class="soft">The {len(records)} largest of {n_all} are shown.</p>' if len(records) < n_all else ""
-    cards = []
-    for record in records:
-        word = "raised" if record.label is ChangeLabel.INCREASED else "lowered"
-        facts = [
-            ("Height change", _fixed(record.dz_m, 2, "m", sign=True)),
-            ("LoD95", _fixed(record.lod95_m, 2, "m")),
-            ("Area", _fixed(record.area_m2, 0, "m²")),
-            ("Volume", _volume(record.volume_m3, sign=True)),
-            ("Position", _position(record.footprint, frame)),
-        ]
-        cards.append(
-            f'<article class="card" id="g{record.ground_change_id}" data-label="{record.label.title}" '
-            f'style="--c:{LABEL_COLOURS[record.label]}"><div><h3>{_chip(record.label, f"Ground {word}")} '
-            f'<small>no. {record.ground_change_id}</small></h3><p class="why">{_sentence(record.reason)}</p>'
-            f"{_facts(facts)}</div>{ground_pictures(scene, record.label, record.footprint)}</article>"
-        )
-    return f"<h2>Changes of the ground</h2>{some}{HOW_TO_READ}" + "".join(cards)
+    cards = _drawn(lambda record: _ground_card(record, scene, frame), records)
+    return f"<h2>Changes of the ground</h2>{some}{HOW_TO_READ}{cards}"
+
+
+def _ground_card(record: GroundChangeRecord, scene: Scene, frame: LocalFrame) -> str:
+    word = "raised" if record.label is ChangeLabel.INCREASED else "lowered"
+    facts = [
+        ("Height change", _fixed(record.dz_m, 2, "m", sign=True)),
+        ("LoD95", _fixed(record.lod95_m, 2, "m")),
+        ("Area", _fixed(record.area_m2, 0, "m²")),
+        ("Volume", _volume(record.volume_m3, sign=True)),
+        ("Position", _position(record.footprint, frame)),
+    ]
+    return (
+        f'<article class="card" id="g{record.ground_change_id}" data-label="{record.label.title}" '
+        f'style="--c:{LABEL_COLOURS[record.label]}"><div><h3>{_chip(record.label, f"Ground {word}")} '
+        f'<small>no. {record.ground_change_id}</small></h3><p class="why">{_sentence(record.reason)}</p>'
+        f"{_facts(facts)}</div>{ground_pictures(scene, record.label, record.footprint)}</article>"
+    )
 
 
 def _settings(parameters: Parameters, run: dict[str, Any]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,8 +12,10 @@ import numpy as np
 import shapely
 
 from loda_pdal.io.colours import LABEL_COLOURS
-from loda_pdal.io.pictures import PlanIndex, View, compose, draw_points, palette, png_data_uri
-from loda_pdal.model.cloud import BoolArray, FloatArray
+from loda_pdal.io.pictures import IndexArray, PlanIndex, View, draw_points, palette, png_data_uri
+from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray
+from loda_pdal.model.grid import cells_of
+from loda_pdal.model.groups import Groups, unique_inverse
 from loda_pdal.model.labels import ChangeLabel
 from loda_pdal.model.pair import Pair
 from loda_pdal.model.records import UIntArray
@@ -69,16 +71,9 @@ class Shape:
 def object_pictures(scene: Scene, object_id: int, label: ChangeLabel, footprint: Any) -> str:
     """Before and after of one object, in plan and in profile, as HTML; empty where no point of it is left."""
     low, high = _bounds(footprint)
-    nearby = scene.index.map(lambda index: index.near(low[0] - 1, low[1] - 1, high[0] + 1, high[1] + 1))
-    parts = Pair(
-        scene.xyz.before[nearby.before[scene.object_of_point.before[nearby.before] == object_id]],
-        scene.xyz.after[nearby.after[scene.object_of_point.after[nearby.after] == object_id]],
-    )
-
-    def is_object(epoch: str, idx: Any, xyz: FloatArray) -> BoolArray:
-        return np.asarray(getattr(scene.object_of_point, epoch)[idx] == object_id)
-
-    return _pictures(scene, parts, label, footprint, is_object)
+    nearby = scene.index.map(lambda index: index.near(*(low - 1.0), *(high + 1.0)))
+    members = nearby.join(scene.object_of_point, lambda idx, number: idx[number[idx] == object_id])
+    return _pictures(scene, members, label, footprint)
 
 
 def ground_pictures(scene: Scene, label: ChangeLabel, footprint: Any) -> str:
@@ -86,62 +81,50 @@ def ground_pictures(scene: Scene, label: ChangeLabel, footprint: Any) -> str:
     low, high = _bounds(footprint)
     shapely.prepare(footprint)
 
-    def is_piece(epoch: str, idx: Any, xyz: FloatArray) -> BoolArray:
-        is_inside = np.asarray(shapely.contains_xy(footprint, xyz[:, 0], xyz[:, 1]), dtype=bool)
-        cells = np.floor((xyz[:, :2] - low) / 2.0).astype(np.int64)
-        _, cell = np.unique(cells, axis=0, return_inverse=True)
-        lowest = np.full(cell.max(initial=-1) + 1, np.inf)
-        np.minimum.at(lowest, cell.ravel(), xyz[:, 2])
-        return is_inside & (xyz[:, 2] < lowest[cell.ravel()] + 0.4)
+    def members(index: PlanIndex, xyz: FloatArray) -> IndexArray:
+        idx = index.near(*low, *(high + _LOWEST_OF_M))
+        nearby = xyz[idx]
+        cell = unique_inverse(cells_of(nearby[:, :2] - low, _LOWEST_OF_M))
+        lowest = Groups(cell, int(cell.max(initial=-1)) + 1).minimum(nearby[:, 2])
+        is_inside = shapely.contains_xy(footprint, nearby[:, 0], nearby[:, 1])
+        return np.asarray(idx[is_inside & (nearby[:, 2] < lowest[cell] + _GROUND_LAYER_M)])
 
-    parts = []
-    for epoch in ("before", "after"):
-        idx = getattr(scene.index, epoch).near(*low, *high)
-        xyz = getattr(scene.xyz, epoch)[idx]
-        parts.append(xyz[is_piece(epoch, idx, xyz)])
-    return _pictures(scene, Pair(*parts), label, footprint, is_piece)
+    return _pictures(scene, scene.index.join(scene.xyz, members), label, footprint)
 
 
-def _pictures(
-    scene: Scene,
-    parts: Pair[FloatArray],
-    label: ChangeLabel,
-    footprint: Any,
-    is_object: Callable[[str, Any, FloatArray], BoolArray],
-) -> str:
-    points = np.concatenate([parts.before, parts.after])
+_LOWEST_OF_M = 2.0
+_GROUND_LAYER_M = 0.4
+
+
+def _pictures(scene: Scene, members: Pair[IndexArray], label: ChangeLabel, footprint: Any) -> str:
+    """Pictures of the points ``members`` of both epochs in their surroundings."""
+    parts = scene.xyz.join(members, lambda xyz, idx: xyz[idx])
+    points = np.concatenate(list(parts))
     if not len(points):
         return ""
     colours = palette(LABEL_COLOURS[label])
     plan, axis = _plan_view(points, footprint), _main_axis(points[:, :2])
     profile, slab = _profile_view(points, axis)
-    centre = points[:, :2].mean(axis=0)
-    cut = np.array([[profile.u0, 0.0], [profile.u0 + profile.width_m, 0.0]])
-    cut[:, 1] = centre @ np.array([-axis[1], axis[0]])
-    cut_xy = cut[:, :1] * axis + cut[:, 1:] * np.array([-axis[1], axis[0]])
-    tops = Pair(*(float(part[:, 2].max()) if len(part) else None for part in parts))
-    cells = []
-    for epoch in ("before", "after"):
-        xyz_all, index = getattr(scene.xyz, epoch), getattr(scene.index, epoch)
-        margin = 0.5
-        idx = index.near(
-            plan.u0 - margin, plan.v0 - margin, plan.u0 + plan.width_m + margin, plan.v0 + plan.height_m + margin
-        )
-        xyz = xyz_all[idx]
-        image = _draw_plan(plan, xyz, is_object(epoch, idx, xyz), scene.point_m)
+    sideways = np.array([-axis[1], axis[0]])
+    ends = np.array([profile.u0, profile.u0 + profile.width_m])
+    cut_xy = ends[:, None] * axis + (points[:, :2].mean(axis=0) @ sideways) * sideways
+    corners = np.array([u * axis + w * sideways for u in ends for w in slab])
+    tops = parts.map(lambda part: float(part[:, 2].max()) if len(part) else None)
+    plans, profiles = [], []
+    for epoch, xyz, index, idx in zip(("before", "after"), scene.xyz, scene.index, members, strict=True):
+        is_member = np.zeros(len(xyz), np.bool_)
+        is_member[idx] = True
+        seen = index.near(plan.u0 - 0.5, plan.v0 - 0.5, plan.u0 + plan.width_m + 0.5, plan.v0 + plan.height_m + 0.5)
+        image = _draw_plan(plan, xyz[seen], is_member[seen], scene.point_m)
         overlay = _outline(footprint, plan, LABEL_COLOURS[label]) + _cut_line(cut_xy, plan)
-        cells.append(_svg(plan, png_data_uri(image, colours), overlay, f"Plan, {epoch}"))
-    for epoch in ("before", "after"):
-        xyz_all, index = getattr(scene.xyz, epoch), getattr(scene.index, epoch)
-        corners = np.array([[u, w] for u in (profile.u0, profile.u0 + profile.width_m) for w in slab])
-        ground = corners[:, :1] * axis + corners[:, 1:] * np.array([-axis[1], axis[0]])
-        idx = index.near(*ground.min(axis=0), *ground.max(axis=0))
-        xyz = xyz_all[idx]
-        across = xyz[:, :2] @ np.array([-axis[1], axis[0]])
-        is_near = (across >= slab[0]) & (across <= slab[1])
-        image = _draw_profile(profile, xyz[is_near], is_object(epoch, idx, xyz)[is_near], axis, scene.point_m)
-        cells.append(_svg(profile, png_data_uri(image, colours), _top_lines(tops, profile, label), f"Profile, {epoch}"))
-    return '<div class="pictures"><b>Before</b><b>After</b>' + "".join(cells) + "</div>"
+        plans.append(_svg(plan, png_data_uri(image, colours), overlay, f"Plan, {epoch}"))
+        seen = index.near(*corners.min(axis=0), *corners.max(axis=0))
+        across = xyz[seen, :2] @ sideways
+        seen = seen[(across >= slab[0]) & (across <= slab[1])]
+        image = _draw_profile(profile, xyz[seen], is_member[seen], axis, scene.point_m)
+        overlay = _top_lines(tops, profile, label)
+        profiles.append(_svg(profile, png_data_uri(image, colours), overlay, f"Profile, {epoch}"))
+    return '<div class="pictures"><b>Before</b><b>After</b>' + "".join(plans + profiles) + "</div>"
 
 
 def _bounds(footprint: Any) -> tuple[FloatArray, FloatArray]:
@@ -182,24 +165,24 @@ def _profile_view(points: FloatArray, axis: FloatArray) -> tuple[View, tuple[flo
     return view, (float(across.min()) - 1.0, float(across.max()) + 1.0)
 
 
-def _draw_plan(view: View, xyz: FloatArray, is_object: BoolArray, point_m: float) -> Any:
-    around, part = xyz[~is_object], xyz[is_object]
-    x, y, z = around.T
-    context = draw_points(view, x, y, z, 0.95 - 0.45 * _scaled(z, floor_m=4.0), point_m * POINT_GROWTH)
-    x, y, z = part.T
-    coloured = draw_points(view, x, y, z, 0.35 + 0.60 * _scaled(z, floor_m=0.5), point_m * POINT_GROWTH)
-    return compose(view.shape, (*context, 0), (*coloured, 1))
+def _draw_plan(view: View, xyz: FloatArray, is_object: BoolArray, point_m: float) -> ByteArray:
+    picture = np.zeros(view.shape, dtype=np.uint8)
+    for ramp, is_drawn, light, spread, floor_m in ((0, ~is_object, 0.95, -0.45, 4.0), (1, is_object, 0.35, 0.60, 0.5)):
+        x, y, z = xyz[is_drawn].T
+        tone = light + spread * _scaled(z, floor_m)
+        draw_points(picture, view, (x, y, z), tone, point_m * POINT_GROWTH, ramp)
+    return picture
 
 
-def _draw_profile(view: View, xyz: FloatArray, is_object: BoolArray, axis: FloatArray, point_m: float) -> Any:
+def _draw_profile(view: View, xyz: FloatArray, is_object: BoolArray, axis: FloatArray, point_m: float) -> ByteArray:
+    picture = np.zeros(view.shape, dtype=np.uint8)
     along, across = xyz[:, :2] @ axis, xyz[:, :2] @ np.array([-axis[1], axis[0]])
     nearness = -across  # seen from the right of the axis: small `across` is near
-    layers = []
-    for is_drawn, ramp, dark, light in ((~is_object, 0, 0.55, 0.92), (is_object, 1, 0.95, 0.55)):
-        near = nearness[is_drawn]
-        tone = light + (dark - light) * _scaled(near, floor_m=1.0)
-        layers.append((*draw_points(view, along[is_drawn], xyz[is_drawn, 2], near, tone, point_m * POINT_GROWTH), ramp))
-    return compose(view.shape, *layers)
+    for ramp, is_drawn, light, spread in ((0, ~is_object, 0.92, -0.37), (1, is_object, 0.55, 0.40)):
+        u, v, near = along[is_drawn], xyz[is_drawn, 2], nearness[is_drawn]
+        tone = light + spread * _scaled(near, floor_m=1.0)
+        draw_points(picture, view, (u, v, near), tone, point_m * POINT_GROWTH, ramp)
+    return picture
 
 
 def _scaled(values: FloatArray, floor_m: float) -> FloatArray:
@@ -298,12 +281,11 @@ def map_svg(scene: Scene, shapes: Iterable[Shape]) -> str:
     shapes = list(shapes)
     view = _map_view(scene, shapes)
     rows, columns = view.shape
-    layers = []
-    for xyz in (scene.xyz.before, scene.xyz.after):  # the later survey where it saw anything
-        tone = 0.97 - 0.40 * _scaled(xyz[:, 2], floor_m=10.0)
+    picture = np.zeros(view.shape, dtype=np.uint8)
+    for xyz in scene.xyz:  # the later survey where it saw anything
         x, y, z = xyz.T
-        layers.append((*draw_points(view, x, y, z, tone, scene.point_m * POINT_GROWTH), 0))
-    image = png_data_uri(compose(view.shape, *layers), palette("#000000"))
+        draw_points(picture, view, (x, y, z), 0.97 - 0.40 * _scaled(z, 10.0), scene.point_m * POINT_GROWTH, ramp=0)
+    image = png_data_uri(picture, palette("#000000"))
     font = max(columns, rows) / 85
     parts = [
         f'<svg viewBox="0 0 {columns} {rows}" role="img" aria-label="Map of changes">',

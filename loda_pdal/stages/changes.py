@@ -19,7 +19,7 @@ from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams, ConfidenceParams, ObservabilityParams
 from loda_pdal.stages.confidence import calibrated, raw_confidence
 from loda_pdal.stages.correspondence import rank_by_place
-from loda_pdal.stages.cues import Evidence, Surface, holders, sample_cells, weigh
+from loda_pdal.stages.cues import Evidence, Surface, Voxels, cells_with_owners, sample_voxels, weigh
 from loda_pdal.stages.observability import Coverage
 from loda_pdal.stages.parts import Parts, dissolve, split_parts
 
@@ -80,18 +80,19 @@ def decide_changes(
         Limits of detection.
     """
     seen = coverage if observability.is_enabled or params.visible_only else None
+    voxels = sample_voxels(surfaces, seen, lod, params)
     n = len(object_class)
-    cast = _Cast(surfaces, object_class, np.full(n, -1, dtype=np.int32), np.zeros(n, np.bool_)).settled(params.voxel_m)
-    cells = sample_cells(cast.surfaces, seen, lod, params)
-    evidence = weigh(cells, cast.surfaces, seen, len(cast), params)
+    cast = _Cast(surfaces, object_class, np.full(n, -1, dtype=np.int32), np.zeros(n, np.bool_)).settled(voxels)
+    cells = cells_with_owners(voxels, cast.surfaces, len(cast), params)
+    evidence = weigh(cells, cast.surfaces, len(cast), params)
     is_no_pair = np.array([_is_no_pair(cue, params) for cue in _rows(evidence, cast.object_class)], dtype=np.bool_)
     if is_no_pair.any():
-        cast = cast.without_pairs(is_no_pair).settled(params.voxel_m)
-        cells = sample_cells(cast.surfaces, seen, lod, params)
+        cast = cast.without_pairs(is_no_pair).settled(voxels)
+        cells = cells_with_owners(voxels, cast.surfaces, len(cast), params)
     if params.find_parts:
-        cast = cast.with_parts(split_parts(cells, cast.surfaces, len(cast), params)).settled(params.voxel_m)
-        cells = sample_cells(cast.surfaces, seen, lod, params)
-    evidence = weigh(cells, cast.surfaces, seen, len(cast), params)
+        cast = cast.with_parts(split_parts(cells, cast.surfaces, len(cast), params)).settled(voxels)
+        cells = cells_with_owners(voxels, cast.surfaces, len(cast), params)
+    evidence = weigh(cells, cast.surfaces, len(cast), params)
     surfaces, object_class, parent, is_apart = cast.surfaces, cast.object_class, cast.parent, cast.is_apart
     cues = _rows(evidence, object_class)
     verdicts = [_verdict(cue, apart, params, observability) for cue, apart in zip(cues, is_apart.tolist(), strict=True)]
@@ -144,26 +145,24 @@ class _Cast:
         surfaces = self.surfaces.join(parts.owner, Surface.owned_by)
         return _Cast(surfaces, self.object_class[whole], parts.parent, self.is_apart[whole])
 
-    def settled(self, voxel_m: float) -> _Cast:
+    def settled(self, voxels: Voxels) -> _Cast:
         """Objects numbered by place, none without a voxel of its own.
 
         Points of an object whose voxels all belong to others go to those, and objects without points are dropped.
         """
         cast = self._by_place()
         while True:
-            holder = cast.surfaces.map(lambda side: holders(side, voxel_m))
+            holder, _ = voxels.holders(cast.surfaces, len(cast))
             has_voxel = np.zeros(len(cast) + 1, np.bool_)
-            for side in holder:
-                has_voxel[side] = True
+            has_voxel[holder] = True
             if has_voxel[:-1].all():
                 return cast
-            owner = Pair(
-                *(
-                    np.where(has_voxel[side.owner], side.owner, own).astype(np.int32)
-                    for side, own in zip(cast.surfaces, holder, strict=True)
-                )
-            )
-            cast = replace(cast, surfaces=cast.surfaces.join(owner, Surface.owned_by))._by_place()
+            cast = cast._inherited(has_voxel, voxels.on_points(holder, cast.surfaces))._by_place()
+
+    def _inherited(self, has_voxel: BoolArray, heir: Pair[IntArray]) -> _Cast:
+        """Points of objects without a voxel given to their heirs."""
+        owner = self.surfaces.join(heir, lambda side, own: np.where(has_voxel[side.owner], side.owner, own))
+        return replace(self, surfaces=self.surfaces.join(owner, Surface.owned_by))
 
     def _by_place(self) -> _Cast:
         owner = self.surfaces.map(lambda side: side.owner)

@@ -1,7 +1,7 @@
 """Change cues (paper, section 4.3): occupied volumes, overlap, height, displacement and detection limit per object.
 
-Everything is sampled on one lattice of occupied voxels for the whole block, once: each occupied voxel knows whose it is
-in each epoch, whether the other epoch has a surface in reach, and whether the other epoch could have seen it.
+Everything is sampled on one lattice of occupied voxels for the whole block, once: whether each epoch has a surface in
+reach and saw the place. Whose a voxel is changes while pairs are undone and parts are taken out: owners come on top.
 """
 
 from __future__ import annotations
@@ -13,9 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from loda_pdal.kernels.neighbours import nearest
+from loda_pdal.kernels.occupancy import column_top_range, holder_range, shared_column_range
+from loda_pdal.kernels.parallel import run_ranges
 from loda_pdal.model.cloud import BoolArray, Float32Array, FloatArray, Int64Array, IntArray
 from loda_pdal.model.grid import Lattice, cells_of
-from loda_pdal.model.groups import Groups, unique_inverse, unique_rows
+from loda_pdal.model.groups import Groups
 from loda_pdal.model.lod_grid import LodGrid
 from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams
@@ -55,21 +57,29 @@ class Surface:
 
 
 @dataclass(frozen=True)
-class Cells:
-    """Occupied voxels of all objects of both epochs, (c,) each.
+class Voxels:
+    """Voxels in which the objects of either epoch have points, (c,), and all that does not depend on whose they are.
+
+    The points of objects, (k,), are those of both epochs, one epoch after the other, sorted by slot: slot ``2 v`` holds
+    the points of the before epoch in voxel v, slot ``2 v + 1`` those of the after epoch.
 
     Attributes
     ----------
     cell : (c, 3) int64
         Lattice index, lexicographically sorted, unique.
-    owner : Pair of (c,) int32
-        Object whose points occupy the voxel in that epoch, -1 where none.
-    n_raw : Pair of (c,) float64
-        Raw points of that object in the voxel.
+    centre : (c, 3) float64, m
+    columns : (b + 1,) int64
+        First voxel of each column, and c.
+    point : (k,) int64
+        Index of each point among the points of both epochs.
+    starts : (2 c + 1,) int64
+        First point of each slot, and k.
+    is_open : (k,) bool
+        Whether the other epoch saw the point's column.
     is_near : Pair of (c,) bool
         Whether that epoch has a surface within the query radius of the centre.
-    is_seen : Pair of (c,) bool
-        Whether that epoch saw the voxel's column, and would have hit what the other epoch shows there.
+    is_covered : Pair of (c,) bool
+        Whether that epoch saw the voxel's column.
     normal : (c, 3) float64
         Mean unit normal of both epochs' nearest surfaces, of either sign; zero where either surface is missing.
     displacement : (c,) float64, m
@@ -79,13 +89,65 @@ class Cells:
     """
 
     cell: Int64Array
-    owner: Pair[IntArray]
-    n_raw: Pair[FloatArray]
+    centre: FloatArray
+    columns: Int64Array
+    point: Int64Array
+    starts: Int64Array
+    is_open: BoolArray
     is_near: Pair[BoolArray]
-    is_seen: Pair[BoolArray]
+    is_covered: Pair[BoolArray]
     normal: FloatArray
     displacement: FloatArray
     lod95: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.cell)
+
+    def holders(self, surfaces: Pair[Surface], n: int) -> tuple[IntArray, FloatArray]:
+        """Object (c, 2) that has each voxel before and after, -1 none, and its raw points (c, 2) in there.
+
+        Where several of the objects 0 to ``n - 1`` meet, the one with most points, then the lowest, has the voxel.
+        """
+        holder = np.full(2 * len(self), -1, dtype=np.int32)
+        n_raw = np.zeros(2 * len(self))
+        points = (self.of_points([side.owner for side in surfaces]), self.of_points([side.n_raw for side in surfaces]))
+        run_ranges(holder_range, 2 * len(self), self.starts, *points, n, holder, n_raw)
+        return holder.reshape(-1, 2), n_raw.reshape(-1, 2)
+
+    def of_points(self, values: list[npt.NDArray[Any]]) -> npt.NDArray[Any]:
+        """Values (k,) of the sorted points from those of both epochs' points."""
+        return np.asarray(np.concatenate(values)[self.point])
+
+    def on_points(self, holder: IntArray, surfaces: Pair[Surface]) -> Pair[IntArray]:
+        """The object that has the voxel of each point of either epoch, -1 for points without object."""
+        n_before = len(surfaces.before.owner)
+        spread = np.full(n_before + len(surfaces.after.owner), -1, dtype=np.int32)
+        spread[self.point] = np.repeat(holder.ravel(), np.diff(self.starts))
+        return Pair(spread[:n_before], spread[n_before:])
+
+
+@dataclass(frozen=True)
+class Cells:
+    """The voxels with their owners, (c,) each.
+
+    Attributes
+    ----------
+    voxels : Voxels
+        Where they are and what was sampled there.
+    owner : Pair of (c,) int32
+        Object whose points occupy the voxel in that epoch, -1 where none.
+    is_seen : Pair of (c,) bool
+        Whether that epoch saw the voxel's column, and would have hit what the other epoch shows there.
+    """
+
+    voxels: Voxels
+    owner: Pair[IntArray]
+    is_seen: Pair[BoolArray]
+
+    @property
+    def is_near(self) -> Pair[BoolArray]:
+        """Whether each epoch has a surface in reach."""
+        return self.voxels.is_near
 
     @property
     def is_gained(self) -> BoolArray:
@@ -157,43 +219,72 @@ class Evidence:
     rise: FloatArray
 
 
-def sample_cells(surfaces: Pair[Surface], coverage: Pair[Coverage] | None, lod: LodGrid, params: ChangeParams) -> Cells:
+def sample_voxels(
+    surfaces: Pair[Surface], coverage: Pair[Coverage] | None, lod: LodGrid, params: ChangeParams
+) -> Voxels:
     """Occupied voxels of all objects (paper, section 4.3: samples x with p_23(x), p_25(x) and their normals).
 
     Without ``coverage`` every voxel counts as seen by both surveys, as in the paper.
     """
-    occupied = surfaces.map(lambda surface: _owned_cells(surface, params.voxel_m))
-    rows = np.concatenate([occupied.before.cell, occupied.after.cell])
-    if len(rows) == 0:
-        nothing, never, no = np.zeros(0, np.int32), np.zeros(0, np.bool_), np.zeros(0)
-        return Cells(
-            rows, Pair(nothing, nothing), Pair(no, no), Pair(never, never), Pair(never, never), np.zeros((0, 3)), no, no
-        )
-    lattice = Lattice.around(rows)
-    keys, first = np.unique(lattice.keys(rows), return_index=True)
-    cell = rows[first]
-    owner = occupied.map(lambda side: _spread(lattice, keys, side.cell, side.owner, -1))
-    n_raw = occupied.map(lambda side: _spread(lattice, keys, side.cell, side.n_raw, 0.0))
-    centre = (cell + 0.5) * params.voxel_m
+    members = surfaces.map(lambda surface: np.flatnonzero(surface.owner >= 0))
+    xyz = surfaces.join(members, lambda surface, idx: surface.xyz[idx])
+    cell, columns, order, starts = _slots(xyz.map(lambda points: cells_of(points, params.voxel_m)))
+    centre = np.asarray((cell + 0.5) * params.voxel_m, dtype=np.float64)
     found = surfaces.map(lambda surface: _nearest_surface(surface, centre, params.query_radius_m))
-    is_near = found.map(lambda idx: idx >= 0)
-    always = np.ones(len(cell), np.bool_)
-    is_seen = coverage.map(lambda side: side.at(centre)) if coverage else Pair(always, always)
-    if params.min_expected_points > 0:
-        expected = _expected_points(owner, n_raw)
-        is_hit = expected.map(lambda points: points >= params.min_expected_points)
-        is_seen = is_seen.join(is_hit, lambda seen, hit: seen & hit)
     normal, displacement = _displacement(surfaces, found)
-    return Cells(cell, owner, n_raw, is_near, is_seen, normal, displacement, lod.at(centre))
+    always = np.ones(len(cell), np.bool_)
+    is_open = xyz.map(lambda points: np.ones(len(points), np.bool_))
+    if coverage:
+        is_open = coverage.swapped.join(xyz, lambda other, points: other.at(points))
+    return Voxels(
+        cell=cell,
+        centre=centre,
+        columns=columns,
+        point=np.concatenate([members.before, members.after + len(surfaces.before.xyz)])[order],
+        starts=starts,
+        is_open=np.concatenate(list(is_open))[order],
+        is_near=found.map(lambda idx: idx >= 0),
+        is_covered=coverage.map(lambda side: side.at(centre)) if coverage else Pair(always, always),
+        normal=normal,
+        displacement=displacement,
+        lod95=lod.at(centre),
+    )
 
 
-def _expected_points(owner: Pair[IntArray], n_raw: Pair[FloatArray]) -> Pair[FloatArray]:
+def cells_with_owners(voxels: Voxels, surfaces: Pair[Surface], n: int, params: ChangeParams) -> Cells:
+    """The voxels with their owners among objects 0 to ``n - 1``."""
+    holder, points = voxels.holders(surfaces, n)
+    owner, n_raw = (Pair(*np.ascontiguousarray(values.T)) for values in (holder, points))
+    is_seen = voxels.is_covered
+    if params.min_expected_points > 0:
+        expected = _expected_points(owner, n_raw, n)
+        is_seen = is_seen.join(expected, lambda seen, points: seen & (points >= params.min_expected_points))
+    return Cells(voxels, owner, is_seen)
+
+
+def _slots(cells: Pair[Int64Array]) -> tuple[Int64Array, Int64Array, Int64Array, Int64Array]:
+    """Voxels (c, 3) of the points, first voxel of each column, order (k,) of all points by slot, and first of each."""
+    rows = np.concatenate(list(cells))
+    if len(rows) == 0:
+        none = np.zeros(0, dtype=np.int64)
+        return rows, np.zeros(1, dtype=np.int64), none, np.zeros(1, dtype=np.int64)
+    is_after = np.repeat(np.array([0, 1]), [len(cells.before), len(cells.after)])
+    key = 2 * Lattice.around(rows).keys(rows) + is_after
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    voxel = np.cumsum(np.diff(key >> 1, prepend=-1) != 0) - 1
+    cell = rows[order[np.diff(voxel, prepend=-1) != 0]]
+    starts = np.searchsorted(2 * voxel + (key & 1), np.arange(2 * len(cell) + 1))
+    is_column = np.any(cell[1:, :2] != cell[:-1, :2], axis=1)
+    return cell, np.concatenate([[0], np.flatnonzero(is_column) + 1, [len(cell)]]), order, starts
+
+
+def _expected_points(owner: Pair[IntArray], n_raw: Pair[FloatArray], n: int) -> Pair[FloatArray]:
     """Raw points (c,) that each epoch should have in a voxel that the other occupies, were the object unchanged.
 
     From the other epoch's points there and the ratio of both epochs' points in the voxels of the object that both
     occupy; an object without such voxels is expected to be sampled alike by both.
     """
-    n = int(max(owner.before.max(), owner.after.max())) + 1
     is_both = (owner.before >= 0) & (owner.before == owner.after)
     shared = n_raw.map(lambda points: np.bincount(owner.before[is_both], weights=points[is_both], minlength=n) + 1.0)
     ratio = np.append(shared.before / shared.after, 1.0)
@@ -203,11 +294,9 @@ def _expected_points(owner: Pair[IntArray], n_raw: Pair[FloatArray]) -> Pair[Flo
     )
 
 
-def weigh(
-    cells: Cells, surfaces: Pair[Surface], coverage: Pair[Coverage] | None, n: int, params: ChangeParams
-) -> Evidence:
+def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -> Evidence:
     """Cues of objects 0 to ``n - 1`` from their voxels and points (paper, section 4.3; METHOD 1.13)."""
-    own = cells.owner
+    voxels, own = cells.voxels, cells.owner
     is_known = Pair(  # own voxels about which the other epoch says something
         (own.before >= 0) & (cells.is_near.after | cells.is_seen.after),
         (own.after >= 0) & (cells.is_near.before | cells.is_seen.before),
@@ -232,19 +321,17 @@ def weigh(
         dv = volume.after - volume.before
     base = volume.before if params.volume_reference == "before" else (volume.before + volume.after) / 2
 
-    samples = Groups(np.where(np.isfinite(cells.displacement[voxel]), owner, -1), n)
+    displacement = voxels.displacement[voxel]
+    samples = Groups(np.where(np.isfinite(displacement), owner, -1), n)
     is_sampled = samples.counts >= params.min_samples
-    displacement = cells.displacement[voxel] * _facing(cells.normal[voxel], samples)
+    displacement = displacement * _facing(voxels.normal[voxel], samples)
     points = surfaces.map(lambda surface: Groups(surface.owner, n))
     height = points.join(surfaces, lambda group, surface: group.quantile(surface.height, 0.95))
-    columns = Pair(
-        _column_tops(surfaces.before, coverage.after if coverage else None, params.voxel_m),
-        _column_tops(surfaces.after, coverage.before if coverage else None, params.voxel_m),
-    )
-    summit = columns.map(lambda side: Groups(side.column[:, 0], n).quantile(side.top, 0.95))
+    columns = _column_tops(voxels, surfaces, n)
+    summit = columns.top.map(lambda top: _summit(columns.owner, top, n))
     top = height if params.height_reference == "ground" else summit
-    middle = np.asarray((cells.cell + 0.5) * params.voxel_m, dtype=np.float64)
-    centroid = own.join(is_known, lambda side, known: Groups(np.where(known, side, -1), n).mean(middle))
+    z = voxels.centre[:, 2]
+    centroid = own.join(is_known, lambda side, known: Groups(np.where(known, side, -1), n).mean(voxels.centre))
     return Evidence(
         n_points=points.join(surfaces, lambda group, surface: group.sum(surface.n_raw)),
         n_voxels=n_voxels,
@@ -260,12 +347,12 @@ def weigh(
         dv_ratio=np.divide(dv, base, out=np.full(n, np.nan), where=base > 0),
         d_perp=np.where(is_sampled, samples.median(displacement), np.nan),
         d_typical=np.where(is_sampled, samples.median(np.abs(displacement)), np.nan),
-        gained_above=_count(own.after, cells.is_gained & _is_above(middle[:, 2], own.after, summit.before), n),
-        lost_above=_count(own.before, cells.is_lost & _is_above(middle[:, 2], own.before, summit.after), n),
+        gained_above=_count(own.after, cells.is_gained & _is_above(z, own.after, summit.before), n),
+        lost_above=_count(own.before, cells.is_lost & _is_above(z, own.before, summit.after), n),
         column_rise=_column_rise(columns, n),
-        lod95=Groups(owner, n).median(cells.lod95[voxel]),
+        lod95=Groups(owner, n).median(voxels.lod95[voxel]),
         observability=(n_known.before + n_known.after) / np.maximum(n_voxels.before + n_voxels.after, 1),
-        rise=_rise(cells, middle[:, 2], n),
+        rise=_rise(cells, n),
     )
 
 
@@ -280,48 +367,6 @@ def _either(cells: Cells) -> tuple[Int64Array, IntArray]:
     after = np.flatnonzero((cells.owner.after >= 0) & (cells.owner.after != cells.owner.before))
     owner = np.concatenate([cells.owner.before[before], cells.owner.after[after]])
     return np.concatenate([before, after]), owner.astype(np.int32)
-
-
-class _Occupied(NamedTuple):
-    """Voxels (k, 3) that an epoch's objects occupy, their owners and the owners' raw points in them (k,)."""
-
-    cell: Int64Array
-    owner: IntArray
-    n_raw: FloatArray
-
-
-def _owned_cells(surface: Surface, voxel_m: float) -> _Occupied:
-    """Voxels that an epoch's objects occupy; where several meet, the one with most points, then the lowest, has it."""
-    is_member = surface.owner >= 0
-    rows = np.column_stack([cells_of(surface.xyz[is_member], voxel_m), surface.owner[is_member]])
-    points = np.asarray(np.bincount(unique_inverse(rows), weights=surface.n_raw[is_member]), dtype=np.float64)
-    rows = unique_rows(rows)
-    order = np.lexsort((rows[:, 3], -points, rows[:, 2], rows[:, 1], rows[:, 0]))
-    rows, points = rows[order], points[order]
-    is_first = np.ones(len(rows), np.bool_)
-    is_first[1:] = np.any(rows[1:, :3] != rows[:-1, :3], axis=1)
-    return _Occupied(rows[is_first, :3], rows[is_first, 3].astype(np.int32), points[is_first])
-
-
-def holders(surface: Surface, voxel_m: float) -> IntArray:
-    """The object that has the voxel of each point (m,), -1 for points without object."""
-    occupied = _owned_cells(surface, voxel_m)
-    holder = np.full(len(surface.xyz), -1, dtype=np.int32)
-    is_member = surface.owner >= 0
-    if is_member.any():
-        lattice = Lattice.around(occupied.cell)
-        found = lattice.find(lattice.keys(occupied.cell), cells_of(surface.xyz[is_member], voxel_m))
-        holder[is_member] = occupied.owner[found]
-    return holder
-
-
-def _spread(
-    lattice: Lattice, keys: Int64Array, cell: Int64Array, values: npt.NDArray[Any], unknown: float
-) -> npt.NDArray[Any]:
-    """Values of an epoch's voxels on the joint list of voxels."""
-    spread = np.full(len(keys), unknown, dtype=values.dtype)
-    spread[lattice.find(keys, cell)] = values
-    return spread
 
 
 def _nearest_surface(surface: Surface, centre: FloatArray, reach_m: float) -> IntArray:
@@ -360,39 +405,38 @@ def _facing(normal: FloatArray, samples: Groups) -> FloatArray:
 
 
 class _Columns(NamedTuple):
-    """Columns (k, 3) of an epoch's objects as rows (object, ix, iy), sorted, and their highest points (k,) m."""
+    """Columns of the objects: the object (b,) of each, and its highest point (b,) m there by epoch; NaN if none."""
 
-    column: Int64Array
-    top: FloatArray
+    owner: IntArray
+    top: Pair[FloatArray]
 
 
-def _column_tops(surface: Surface, other: Coverage | None, cell_m: float) -> _Columns:
+def _column_tops(voxels: Voxels, surfaces: Pair[Surface], n: int) -> _Columns:
     """Highest point in each column of each object, in the columns that the other epoch saw.
 
     A part that one survey never saw is no growth.
     """
-    is_in = surface.owner >= 0
-    if other is not None:
-        is_in &= other.at(surface.xyz)
-    column = np.column_stack([surface.owner[is_in], cells_of(surface.xyz[is_in, :2], cell_m)])
-    z = surface.xyz[is_in, 2]
-    order = np.lexsort((z, column[:, 2], column[:, 1], column[:, 0]))
-    column, z = column[order], z[order]
-    is_last = np.ones(len(z), np.bool_)
-    is_last[:-1] = np.any(column[1:] != column[:-1], axis=1)
-    return _Columns(column[is_last], z[is_last])
+    points = (voxels.of_points([side.owner for side in surfaces]), voxels.of_points([s.xyz[:, 2] for s in surfaces]))
+    owner = np.full(len(voxels.point), -1, dtype=np.int32)
+    top = np.full((len(owner), 2), np.nan)
+    n_columns = len(voxels.columns) - 1
+    run_ranges(column_top_range, n_columns, voxels.columns, voxels.starts, *points, voxels.is_open, n, owner, top)
+    is_column = owner >= 0
+    return _Columns(owner[is_column], Pair(*np.ascontiguousarray(top[is_column].T)))
 
 
-def _column_rise(columns: Pair[_Columns], n: int) -> FloatArray:
+def _summit(owner: IntArray, top: FloatArray, n: int) -> FloatArray:
+    """95th percentile (n,) m of the tops of each object's columns."""
+    is_known = np.isfinite(top)
+    return Groups(owner[is_known], n).quantile(top[is_known], 0.95)
+
+
+def _column_rise(columns: _Columns, n: int) -> FloatArray:
     """Median change of the columns' tops (n,) m over the columns that both epochs have."""
-    if len(columns.before.column) == 0 or len(columns.after.column) == 0:
-        return np.full(n, np.nan)
-    lattice = Lattice.around(np.concatenate([side.column for side in columns]))
-    found = lattice.find(lattice.keys(columns.before.column), columns.after.column)
-    is_both = found >= 0
-    groups = Groups(columns.after.column[is_both, 0], n)
-    rise = groups.median(columns.after.top[is_both] - columns.before.top[found[is_both]])
-    return np.where(groups.counts >= _LEAST_COLUMNS, rise, np.nan)
+    rise = columns.top.after - columns.top.before
+    is_both = np.isfinite(rise)
+    groups = Groups(columns.owner[is_both], n)
+    return np.where(groups.counts >= _LEAST_COLUMNS, groups.median(rise[is_both]), np.nan)
 
 
 _LEAST_COLUMNS = 8
@@ -403,13 +447,12 @@ def _is_above(z: FloatArray, owner: IntArray, top: FloatArray) -> BoolArray:
     return np.asarray(z > np.append(top, np.nan)[owner])
 
 
-def _rise(cells: Cells, z: FloatArray, n: int) -> FloatArray:
+def _rise(cells: Cells, n: int) -> FloatArray:
     """How far the mean height of occupancy moves up (n,) m in the columns that both epochs occupy (tie-break)."""
-    own = cells.owner
-    voxel, owner = _either(cells)
-    column = unique_inverse(np.column_stack([owner.astype(np.int64), cells.cell[voxel, :2]]))
-    is_own = own.map(lambda side: side[voxel] == owner)
-    is_in = is_own.map(lambda side: np.bincount(column, weights=side)[column] > 0 if len(column) else side)
-    is_shared = is_in.before & is_in.after
-    mean = is_own.map(lambda side: Groups(np.where(is_shared & side, owner, -1), n).mean(z[voxel]))
+    columns, holder = cells.voxels.columns, np.column_stack(list(cells.owner))
+    is_shared = np.zeros(holder.shape, np.bool_)
+    run_ranges(shared_column_range, len(columns) - 1, columns, holder, n, is_shared)
+    z = cells.voxels.centre[:, 2]
+    shared = Pair(*is_shared.T)
+    mean = cells.owner.join(shared, lambda side, is_in: Groups(np.where(is_in, side, -1), n).mean(z))
     return mean.after - mean.before

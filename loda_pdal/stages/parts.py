@@ -60,7 +60,7 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangePar
     """
     owner = surfaces.map(lambda surface: surface.owner)
     nobody = np.full(n, -1, dtype=np.int32)
-    if n == 0 or len(cells.cell) == 0:
+    if n == 0 or len(cells.voxels) == 0:
         return Parts(owner, nobody)
     is_present = owner.map(lambda side: np.isin(np.arange(n), side))
     is_pair = is_present.before & is_present.after
@@ -104,7 +104,7 @@ def dissolve(owner: Pair[IntArray], is_dissolved: BoolArray, n: int) -> tuple[Pa
 
 def _columns_of(cells: Cells, n: int) -> tuple[Int64Array, Int64Array]:
     """All columns (k, 3) of all objects as rows (object, ix, iy), sorted, and where each object's begin (n + 1,)."""
-    owned = [np.column_stack([side, cells.cell[:, :2]])[side >= 0] for side in cells.owner]
+    owned = [np.column_stack([side, cells.voxels.cell[:, :2]])[side >= 0] for side in cells.owner]
     rows = unique_rows(np.concatenate(owned).astype(np.int64))
     return rows, np.searchsorted(rows[:, 0], np.arange(n + 1))
 
@@ -117,7 +117,7 @@ def _regions(
     if len(members) == 0:
         return []
     # one tree for all objects: a fourth coordinate keeps them apart
-    place = np.column_stack([cells.cell[members], owner[members].astype(np.int64) * 10])
+    place = np.column_stack([cells.voxels.cell[members], owner[members].astype(np.int64) * 10])
     links = cKDTree(place).query_pairs(_LINK_VOXELS, output_type="ndarray")
     graph = coo_array((np.ones(len(links), np.int8), (links[:, 0], links[:, 1])), shape=(len(members),) * 2)
     region = connected_components(graph, directed=False)[1]
@@ -125,7 +125,7 @@ def _regions(
     found = []
     for index in np.flatnonzero(groups.counts >= params.part_min_voxels).tolist():
         inside = members[groups.members(index)]
-        plan = unique_rows(cells.cell[inside, :2])
+        plan = unique_rows(cells.voxels.cell[inside, :2])
         found.append(_Region(int(owner[inside[0]]), plan, len(inside)))
     return found
 
