@@ -200,8 +200,8 @@ def _blocks(result: ChangeResult) -> list[dict[str, Any]]:
         {
             "outline": result.block,
             "area_m2": float(result.block.area),
-            "points_before": len(result.points.before.change),
-            "points_after": len(result.points.after.change),
+            "points_before": len(result.points.before),
+            "points_after": len(result.points.after),
             "n_objects": len(result.objects),
             "n_changes": len(result.changes),
         }

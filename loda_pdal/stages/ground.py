@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from loda_pdal.kernels.ground_planes import fit_planes
+from loda_pdal.kernels.ground_planes import blended_height_range, fit_planes
+from loda_pdal.kernels.parallel import run_ranges
 from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array, IntArray
 from loda_pdal.model.transform import rotation_between
 from loda_pdal.params import GroundParams
@@ -75,22 +76,12 @@ class GroundModel:
 
     def height_at(self, xy: FloatArray) -> FloatArray:
         """Ground height (k,) m at plan positions (k, 2) m; NaN where there is none. Continuous where defined."""
-        if self.height.size == 0 or len(xy) == 0:
-            return np.full(len(xy), np.nan)
-        scaled = xy / self.cell_m - 0.5 - self.first
-        base = np.floor(scaled).astype(np.int64)
-        part = scaled - base
-        total, weight = np.zeros(len(xy)), np.zeros(len(xy))
-        for offset in np.ndindex(2, 2):
-            i, j = base[:, 0] + offset[0], base[:, 1] + offset[1]
-            is_inside = (i >= 0) & (i < self.height.shape[0]) & (j >= 0) & (j < self.height.shape[1])
-            i, j = np.where(is_inside, i, 0), np.where(is_inside, j, 0)
-            away = (part - offset) * self.cell_m
-            plane = self.height[i, j] + np.sum(self.slope[i, j] * away, axis=1)
-            w = np.prod(1.0 - np.abs(part - offset), axis=1) * (is_inside & np.isfinite(plane))
-            total += w * np.where(w > 0, plane, 0.0)
-            weight += w
-        return np.where(weight > 1e-9, total / np.maximum(weight, 1e-9), np.nan)
+        found = np.full(len(xy), np.nan)
+        planes = np.ascontiguousarray(self.height), np.ascontiguousarray(self.slope)
+        run_ranges(
+            blended_height_range, len(xy), np.ascontiguousarray(xy), float(self.cell_m), self.first, *planes, found
+        )
+        return found
 
 
 def ground_model(xyz: FloatArray, n_raw: IntArray, params: GroundParams) -> GroundModel:
