@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import shapely
 
+from loda_pdal.model import dimensions as dims
 from loda_pdal.model.cloud import ByteArray, Float32Array, FloatArray, IntArray, VoxelCloud
 from loda_pdal.model.groups import Groups
 from loda_pdal.model.labels import ChangeLabel, ObjectClass
 from loda_pdal.model.lod_grid import LodGrid
 from loda_pdal.model.pair import Pair
 from loda_pdal.model.records import GroundChangeRecord, InstanceRecord, ObjectRecord, PointLabels
+from loda_pdal.model.survey import Survey
 from loda_pdal.model.transform import transform_points
 from loda_pdal.stages.changes import Changes
 from loda_pdal.stages.confidence import ground_confidence
@@ -106,7 +109,7 @@ def instance_records(
 
 
 def point_labels(
-    xyz: FloatArray,
+    survey: Survey,
     T_frame: FloatArray,
     cloud: VoxelCloud,
     ground: GroundModel,
@@ -118,19 +121,28 @@ def point_labels(
     ground_changes: GroundChanges,
     min_dz_m: float,
 ) -> PointLabels:
-    """Values of the raw points (n, 3) of one epoch, in their order; outliers are noise and nothing else."""
+    """Values of the raw points of one epoch; outliers are noise and nothing else."""
     change, confidence = _voxel_changes(cloud, instances, owner, changes, ground_changes, min_dz_m)
+    of_voxel = np.empty(len(cloud) + 1, dtype=dims.FOUND)
+    for dimension, values, of_noise in (
+        (dims.CLASSIFICATION, instances.classification, ObjectClass.NOISE),
+        (dims.HEIGHT, math.nan, math.nan),
+        (dims.LOD95, lod.at(cloud.xyz), dims.LOD95.unknown),
+        (dims.SUPERPOINT, superpoint + 1, dims.SUPERPOINT.unknown),
+        (dims.INSTANCE, instances.instance, dims.INSTANCE.unknown),
+        (dims.OBJECT, owner + 1, dims.OBJECT.unknown),
+        (dims.CHANGE, change, dims.CHANGE.unknown),
+        (dims.CONFIDENCE, confidence, dims.CONFIDENCE.unknown),
+    ):
+        of_voxel[dimension.name][:-1] = values
+        of_voxel[dimension.name][-1] = of_noise
+    return PointLabels(survey, cloud.voxel_idx, of_voxel, partial(height_of_points, T_frame, ground))
+
+
+def height_of_points(T_frame: FloatArray, ground: GroundModel, xyz: FloatArray) -> FloatArray:
+    """Height above ground (n,), m, of points (n, 3), local m, that ``T_frame`` moves into the ground model's frame."""
     moved = transform_points(T_frame, xyz)
-    return PointLabels(
-        classification=spread(cloud, instances.classification, ObjectClass.NOISE, "uint8"),
-        height=moved[:, 2] - ground.height_at(moved[:, :2]),
-        lod95=spread(cloud, lod.at(cloud.xyz), math.nan, "float32"),
-        superpoint=spread(cloud, superpoint + 1, 0, "uint32"),
-        instance=spread(cloud, instances.instance, 0, "uint32"),
-        object=spread(cloud, owner + 1, 0, "uint32"),
-        change=spread(cloud, change, ChangeLabel.UNDETERMINED, "uint8"),
-        confidence=spread(cloud, confidence, math.nan, "float32"),
-    )
+    return np.asarray(moved[:, 2] - ground.height_at(moved[:, :2]))
 
 
 def ground_records(ground_changes: GroundChanges, T_after_frame: FloatArray) -> list[GroundChangeRecord]:

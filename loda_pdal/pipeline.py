@@ -18,7 +18,6 @@ import numpy as np
 
 from loda_pdal.assembly import ground_records, instance_records, object_records, outline_of, point_labels
 from loda_pdal.model.cloud import BoolArray, FloatArray, IntArray, VoxelCloud
-from loda_pdal.model.groups import count_cells
 from loda_pdal.model.labels import ChangeLabel, ObjectClass
 from loda_pdal.model.lod_grid import LodGrid
 from loda_pdal.model.pair import Pair, at_once
@@ -37,7 +36,7 @@ from loda_pdal.stages.changes import Changes, decide_changes
 from loda_pdal.stages.correspondence import Objects, match_instances, owners
 from loda_pdal.stages.cues import Surface
 from loda_pdal.stages.features import Features, eigen_features
-from loda_pdal.stages.fuse import fuse_points
+from loda_pdal.stages.fuse import fuse_survey
 from loda_pdal.stages.ground import GroundModel, ground_model, vertical_rotation
 from loda_pdal.stages.ground_changes import GroundChanges, ground_changes
 from loda_pdal.stages.instances import Instances, form_instances
@@ -87,11 +86,11 @@ def detect_changes(
     ChangeResult
         Objects, changed ground, and values for every raw point, in local metres of the after frame.
     """
-    points = Pair(before.xyz, after.xyz)
-    p = resolve(parameters or Parameters(), points)
+    surveys = Pair(before, after)
+    p = resolve(parameters or Parameters(), surveys)
     clock = StepClock(progress)
     with clock("fuse"):
-        fused = fuse_epochs(points, p)
+        fused = fuse_epochs(surveys, p)
     with clock("register"):
         registration = register_epochs(fused, p)
         clouds = into_frame(fused, registration)
@@ -114,7 +113,7 @@ def detect_changes(
     with clock("ground_changes"):
         ground_change = compare_ground(clouds, instances, lod, p)
     with clock("result"):
-        result = assemble(points, clouds, registration, ground, lod, segments, instances, changes, ground_change, p)
+        result = assemble(surveys, clouds, registration, ground, lod, segments, instances, changes, ground_change, p)
     return replace(result, costs=clock.costs)
 
 
@@ -142,27 +141,16 @@ class Segments:
     superpoints: Superpoints
 
 
-def resolve(parameters: Parameters, points: Pair[FloatArray]) -> Parameters:
-    """Parameters for these points (n, 3) m: neighbourhoods grow with the sparser survey's spacing where allowed."""
+def resolve(parameters: Parameters, surveys: Pair[Survey]) -> Parameters:
+    """Parameters for these points: neighbourhoods grow with the sparser survey's spacing where that is allowed."""
     if not parameters.adapts_to_spacing:
         return parameters
-    return parameters.for_spacing(max(mean_spacing(points.before), mean_spacing(points.after)))
+    return parameters.for_spacing(max(survey.extent.spacing_m for survey in surveys))
 
 
-def mean_spacing(xyz: FloatArray) -> float:
-    """Mean point spacing (m) in plan: root of the area of occupied 5 m cells, with their gaps, per point."""
-    if len(xyz) == 0:
-        return 0.0
-    n_cells = count_cells(xyz[:, :2], np.zeros(len(xyz), dtype=np.int8), 1, _SPACING_CELL_M)[0]
-    return float(_SPACING_CELL_M * np.sqrt(n_cells / len(xyz)))
-
-
-_SPACING_CELL_M = 5.0
-
-
-def fuse_epochs(points: Pair[FloatArray], p: Parameters) -> Pair[VoxelCloud]:
+def fuse_epochs(surveys: Pair[Survey], p: Parameters) -> Pair[VoxelCloud]:
     """One point per voxel, without statistical outliers (section 4.1)."""
-    return at_once(lambda xyz: remove_outliers(fuse_points(xyz, p.fuse), p.outliers), points)
+    return at_once(lambda survey: remove_outliers(fuse_survey(survey, p.fuse), p.outliers), surveys)
 
 
 def register_epochs(fused: Pair[VoxelCloud], p: Parameters) -> Registration:
@@ -285,7 +273,7 @@ def compare_ground(clouds: Pair[VoxelCloud], instances: Pair[Instances], lod: Lo
 
 
 def assemble(
-    points: Pair[FloatArray],
+    surveys: Pair[Survey],
     clouds: Pair[VoxelCloud],
     registration: Registration,
     ground: Pair[Ground],
@@ -300,10 +288,20 @@ def assemble(
     in_after = clouds.map(lambda cloud: transform_points(registration.T_after_frame, cloud.xyz))
 
     def labels_of(
-        xyz: FloatArray, T: FloatArray, cloud: VoxelCloud, g: Ground, s: Segments, i: Instances, o: IntArray
+        survey: Survey, T: FloatArray, cloud: VoxelCloud, g: Ground, s: Segments, i: Instances, o: IntArray
     ) -> PointLabels:
         return point_labels(
-            xyz, T, cloud, g.model, lod, s.superpoints.labels, i, o, changes, ground_change, p.ground_changes.min_dz_m
+            survey,
+            T,
+            cloud,
+            g.model,
+            lod,
+            s.superpoints.labels,
+            i,
+            o,
+            changes,
+            ground_change,
+            p.ground_changes.min_dz_m,
         )
 
     def instances_of(cloud: VoxelCloud, xyz: FloatArray, g: Ground, i: Instances, o: IntArray) -> list[InstanceRecord]:
@@ -315,7 +313,7 @@ def assemble(
         objects=object_records(in_after, instances, changes, _outline_m(p)),
         ground_changes=ground_records(ground_change, registration.T_after_frame),
         instances=at_once(instances_of, clouds, in_after, ground, instances, changes.owner),
-        points=at_once(labels_of, points, moves, clouds, ground, segments, instances, changes.owner),
+        points=at_once(labels_of, surveys, moves, clouds, ground, segments, instances, changes.owner),
         registration=registration,
         lod=lod,
         clouds=in_after,

@@ -12,6 +12,7 @@ from laspy.vlrs.known import WktCoordinateSystemVlr
 from pyproj import CRS
 
 from loda_pdal.io.las import read_epochs
+from loda_pdal.model.dimensions import FOUND
 from loda_pdal.model.errors import LodaError
 from loda_pdal.model.labels import ChangeLabel, ObjectClass
 from loda_pdal.model.lod_grid import LodGrid
@@ -82,20 +83,25 @@ def make_surveys(folder: Path, **after: Any) -> Pair[Survey]:
     return read_epochs(before, make_las(folder / "after.laz", scattered(1500, seed=2), **after))
 
 
-def make_labels(n: int, seed: int = 5) -> PointLabels:
-    """Values of every kind, unknown ones among them."""
-    rng = np.random.default_rng(seed)
-    change = rng.integers(0, 6, n).astype(np.uint8)
-    return PointLabels(
-        classification=rng.choice(np.array([1, 2, 5, 6, 7, 64, 65], dtype=np.uint8), n),
-        height=np.where(rng.random(n) < 0.1, np.nan, rng.uniform(0.0, 20.0, n)),
-        lod95=np.where(rng.random(n) < 0.1, np.nan, rng.uniform(0.02, 0.3, n)).astype(np.float32),
-        superpoint=rng.integers(0, 100_000, n).astype(np.uint32),
-        instance=rng.integers(0, 50, n).astype(np.uint32),
-        object=rng.integers(0, 70_000, n).astype(np.uint32),
-        change=change,
-        confidence=np.where(change == 0, np.nan, rng.random(n)).astype(np.float32),
-    )
+def make_labels(survey: Survey, seed: int = 5) -> PointLabels:
+    """Values of every kind, unknown ones among them; each point is a voxel of its own, but for some noise."""
+    n, rng = len(survey), np.random.default_rng(seed)
+    found = np.zeros(n + 1, dtype=FOUND)
+    found["Classification"] = rng.choice(np.array([1, 2, 5, 6, 64, 65]), n + 1)
+    found["LoD95"] = np.where(rng.random(n + 1) < 0.1, np.nan, rng.uniform(0.02, 0.3, n + 1))
+    found["Superpoint"] = rng.integers(0, 100_000, n + 1)
+    found["InstanceId"] = rng.integers(0, 50, n + 1)
+    found["ObjectId"] = rng.integers(0, 70_000, n + 1)
+    found["ChangeClass"] = rng.integers(0, 6, n + 1)
+    found["ChangeConfidence"] = np.where(found["ChangeClass"] == 0, np.nan, rng.random(n + 1))
+    found["Classification"][-1] = 7
+    voxel_idx = np.where(rng.random(n) < 0.1, -1, np.arange(n)).astype(np.int32)
+    return PointLabels(survey, voxel_idx, found, made_up_height)
+
+
+def made_up_height(xyz: np.ndarray) -> np.ndarray:
+    """A height (n,) for points (n, 3), NaN for a tenth of them."""
+    return np.where(xyz[:, 0] % 1.0 < 0.1, np.nan, xyz[:, 2] - 75.0 + 0.1 * xyz[:, 1])
 
 
 def make_registration() -> Registration:
@@ -193,7 +199,7 @@ def make_result(surveys: Pair[Survey], **changed: Any) -> ChangeResult:
             [InstanceRecord(4, ObjectClass.BUILDING, square(130.0, 230.0), 410, 6.0, 96.0, 75.0, 81.0, 7)],
             [InstanceRecord(5, ObjectClass.OTHER, square(130.0, 230.0), 500, None, 144.0, 75.0, 84.0, None)],
         ),
-        "points": Pair(make_labels(len(surveys.before), 5), make_labels(len(surveys.after), 6)),
+        "points": Pair(make_labels(surveys.before, 5), make_labels(surveys.after, 6)),
         "registration": make_registration(),
         "lod": make_lod(),
         "clouds": clouds,

@@ -155,7 +155,10 @@ def test_too_few_points_for_the_extent(tmp_path: Path) -> None:
 def test_wrong_bounds_in_the_header_do_not_matter(good: Path, tmp_path: Path) -> None:
     for number, bounds in enumerate(([0.0] * 6, [float("nan")] * 6, [1e308, -1e308] * 3)):
         path = patched(make_las(tmp_path / f"{number}.las"), BOUNDS_AT, *bounds)
-        assert len(read_epochs(path, good).before) == 2000
+        survey = read_epochs(path, good).before
+        assert len(survey) == 2000 and survey.frame.origin == (634_000, 4_831_000, 0)
+    far = patched(make_las(tmp_path / "far.las"), BOUNDS_AT, 634_180.0, 633_500.0)  # x only: highest, lowest
+    np.testing.assert_array_equal(read_epochs(far, good).before.xyz, read_epochs(good, good).before.xyz)
 
 
 # Coordinate reference systems
@@ -311,7 +314,7 @@ def test_memory_is_estimated_before_reading(good: Path, monkeypatch: pytest.Monk
     def never(*args: Any) -> None:
         pytest.fail("points were read although the memory does not suffice")
 
-    monkeypatch.setattr("loda_pdal.io.las._read_points", never)
+    monkeypatch.setattr("loda_pdal.io.las_points.LasFile.records", never)
     with pytest.raises(MemoryLimitError) as caught:
         read_epochs(good, good, max_memory=10_000)
     assert caught.value.code == "memory-limit"

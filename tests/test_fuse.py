@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,8 +11,9 @@ from hypothesis import strategies as st
 
 from loda_pdal.model.cloud import to_local_grid
 from loda_pdal.model.errors import InputError
+from loda_pdal.model.survey import Survey
 from loda_pdal.params import FuseParams
-from loda_pdal.stages.fuse import downsample, fuse_points
+from loda_pdal.stages.fuse import downsample, fuse_points, fuse_survey
 
 PARAMS = FuseParams(leaf_m=0.25)
 
@@ -62,6 +65,22 @@ def test_many_more_voxels_than_the_first_table_holds() -> None:
     xyz = np.stack(np.meshgrid(np.arange(400), np.arange(500), [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
     fused = fuse_points(xyz[::-1], PARAMS)
     assert np.array_equal(fused.xyz, xyz)
+
+
+@given(st.integers(0, 1000), st.integers(1, 400), st.integers(1, 200))
+def test_parts_give_what_the_whole_gives(seed: int, n: int, size: int) -> None:
+    xyz = cloud(seed, n)
+
+    class Parts:
+        def __len__(self) -> int:
+            return n
+
+        def coordinates(self) -> Iterator[np.ndarray]:
+            return (xyz[start : start + size] for start in range(0, n, size))
+
+    whole, parts = fuse_points(xyz, PARAMS), fuse_survey(Survey(Parts()), PARAMS)
+    for name in ("xyz", "n_raw", "voxel_idx"):
+        assert np.array_equal(getattr(whole, name), getattr(parts, name))
 
 
 def test_downsample_is_the_mean_per_voxel() -> None:

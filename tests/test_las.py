@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import struct
 from pathlib import Path
@@ -22,22 +23,27 @@ from io_samples import (
 from laspy.vlrs.known import GeoKeyDirectoryVlr
 from pyproj import CRS
 
-from loda_pdal.io.las import inspect, overlap, plan_overlap, read_epochs
+from loda_pdal.io.gps_time import gps_day
+from loda_pdal.io.las import inspect, overlap, read_epochs
+from loda_pdal.io.las_points import LasFile
 from loda_pdal.io.las_writer import las_wkt, write_cloud
 from loda_pdal.io.transform import read_map_transform, write_transform
 from loda_pdal.model.cloud import LOCAL_GRID
 from loda_pdal.model.dimensions import EXTRA_DIMENSIONS
 from loda_pdal.model.errors import InputError, OutputError
+from loda_pdal.model.extent import Extent
 from loda_pdal.model.frame import LocalFrame
 from loda_pdal.model.pair import Pair
 from loda_pdal.model.registration import Registration
 from loda_pdal.model.survey import Survey
 from loda_pdal.model.transform import exp_se3
+from loda_pdal.params import FuseParams
+from loda_pdal.stages.fuse import fuse_survey
 
 
 def written(folder: Path, surveys: Pair[Survey], name: str = "out.laz", **options: Any) -> tuple[Any, Pair[Any]]:
     """The output cloud of two surveys as it reads back, and the labels that went in."""
-    labels = Pair(make_labels(len(surveys.before), 5), make_labels(len(surveys.after), 6))
+    labels = Pair(make_labels(surveys.before, 5), make_labels(surveys.after, 6))
     T = options.pop("T", make_registration().T_after_before)
     write_cloud(folder / name, surveys, labels, T, **options)
     return laspy.read(folder / name), labels
@@ -111,7 +117,8 @@ def test_reading_keeps_the_points_it_was_given(tmp_path: Path) -> None:
     path = make_las(tmp_path / "a.laz", extra={"tree": np.arange(2000, dtype=np.uint16)})
     survey = read_epochs(path, path).before
     assert survey.path == str(path)
-    np.testing.assert_array_equal(survey.source["tree"], np.arange(2000))
+    assert isinstance(survey.source, LasFile)
+    np.testing.assert_array_equal(np.concatenate([part["tree"] for part in survey.source.records()]), np.arange(2000))
 
 
 def test_inspect_says_what_the_header_says(tmp_path: Path) -> None:
@@ -139,12 +146,72 @@ def test_overlap_is_the_share_of_the_smaller_bounds(tmp_path: Path) -> None:
     assert overlap(big, big) == 1.0
 
 
-def test_plan_overlap_counts_occupied_cells() -> None:
-    cells = np.array([[5.0, 5, 0], [15, 5, 0], [25, 5, 0], [5, 15, 0], [5, 16, 9]])
-    shifted = np.array([[15.0, 5, 0], [25, 5, 0], [35, 5, 0], [45, 5, 0], [55, 5, 0]])
-    assert plan_overlap(cells, shifted) == pytest.approx(2 / 4)  # cells occupies 4, shifted 5, both 2
-    assert plan_overlap(shifted, cells) == pytest.approx(2 / 4)
-    assert plan_overlap(cells - 1e4, shifted - 1e4) == pytest.approx(2 / 4)
+def stored(survey: Survey, name: str) -> np.ndarray:
+    """One dimension of all points of the file behind a survey."""
+    return np.asarray(laspy.read(survey.path)[name])
+
+
+@pytest.fixture
+def unkept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files are decompressed anew every time, in parts of 333 points."""
+    monkeypatch.setattr("loda_pdal.io.las_points.KEPT_BYTES", 0)
+    monkeypatch.setattr("loda_pdal.io.las_points.PART", 333)
+
+
+@pytest.mark.parametrize("point_format", [3, 6])
+def test_a_file_is_read_anew_as_it_was_read_first(
+    tmp_path: Path, unkept: None, monkeypatch: pytest.MonkeyPatch, point_format: int
+) -> None:
+    path = make_las(tmp_path / "a.laz", point_format=point_format, fields={"intensity": np.arange(2000)})
+    survey = read_epochs(path, path).before
+    assert isinstance(survey.source, LasFile)
+    assert [len(part) for part in survey.parts()] == [333] * 6 + [2]
+    for _ in range(2):
+        np.testing.assert_array_equal(np.concatenate([r["intensity"] for r in survey.source.records()]), range(2000))
+    anew = survey.xyz
+    monkeypatch.undo()
+    np.testing.assert_array_equal(read_epochs(path, path).before.xyz, anew)
+
+
+def test_a_small_file_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    survey = read_epochs(make_las(tmp_path / "a.laz"), make_las(tmp_path / "b.laz")).before
+    (tmp_path / "a.laz").unlink()
+    assert len(survey.xyz) == 2000
+
+
+def test_what_is_known_of_a_survey_from_its_first_reading(tmp_path: Path, unkept: None) -> None:
+    path = make_las(tmp_path / "a.laz")
+    survey = read_epochs(path, path).before
+    assert (survey.n_bytes, survey.sha256) == (path.stat().st_size, hashlib.sha256(path.read_bytes()).hexdigest())
+    found, again = survey.extent, Extent.of([survey.xyz])
+    assert found.n == again.n == 2000
+    for name in ("low", "high", "cells"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(again, name))
+
+
+def test_a_file_that_changes_during_a_run_is_named(tmp_path: Path, unkept: None) -> None:
+    surveys = make_surveys(tmp_path)
+    make_las(tmp_path / "after.laz", scattered(1500, seed=3))
+    with pytest.raises(InputError, match=r"after\.laz: was changed") as caught:
+        written(tmp_path, surveys)
+    assert caught.value.code == "input-changed"
+    (tmp_path / "before.laz").unlink()
+    with pytest.raises(InputError, match=r"before\.laz: cannot be read"):
+        fuse_survey(surveys.before, FuseParams())
+
+
+def test_dates_come_from_absolute_gps_time_only(tmp_path: Path) -> None:
+    assert gps_day(315_964_800.0 - 1e9 + 18.0 + 86_400.0 * 0) is None  # 1990: no lidar survey
+    assert gps_day(1_261_872_018.0 - 1e9) == "2020-01-01"
+    assert gps_day(1_261_872_017.0 - 1e9) == "2019-12-31"
+    assert gps_day(float("nan")) is None
+    days = np.linspace(1_261_872_018.0 - 1e9, 1_262_044_818.0 - 1e9, 2000)
+    path = make_las(tmp_path / "a.laz", fields={"gps_time": days})
+    assert read_epochs(path, path).before.dates == (None, None)  # seconds of an unknown week
+    data = laspy.read(path)
+    data.header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
+    data.write(path)
+    assert read_epochs(path, path).before.dates == ("2020-01-01", "2020-01-03")
 
 
 def make_copc(path: Path, xyz: np.ndarray) -> Path:
@@ -273,12 +340,12 @@ def test_points_that_are_not_moved_keep_their_stored_integers(tmp_path: Path) ->
     moved, _ = written(tmp_path, surveys, "moved.laz")
     kept, _ = written(tmp_path, surveys, "kept.las", keep_frames=True)
     for cloud in (moved, kept):
-        np.testing.assert_array_equal(cloud.header.scales, surveys.after.source.header.scales)
-        np.testing.assert_array_equal(cloud.header.offsets, surveys.after.source.header.offsets)
+        np.testing.assert_array_equal(cloud.header.scales, laspy.read(surveys.after.path).header.scales)
+        np.testing.assert_array_equal(cloud.header.offsets, laspy.read(surveys.after.path).header.offsets)
         for axis in "XYZ":
-            np.testing.assert_array_equal(cloud[axis][n:], surveys.after.source[axis])
+            np.testing.assert_array_equal(cloud[axis][n:], stored(surveys.after, axis))
     for axis in "XYZ":
-        np.testing.assert_array_equal(kept[axis][:n], surveys.before.source[axis])
+        np.testing.assert_array_equal(kept[axis][:n], stored(surveys.before, axis))
 
 
 @pytest.mark.parametrize("crs", ["EPSG:32617", "EPSG:2269+5703"])
@@ -412,7 +479,7 @@ def test_different_scales_give_the_finest_and_an_offset_that_holds_all(tmp_path:
     cloud, _ = written(tmp_path, surveys, keep_frames=True)
     np.testing.assert_array_equal(cloud.header.scales, np.full(3, 0.0001))
     for axis in "xyz":
-        expected = np.concatenate([surveys.before.source[axis], surveys.after.source[axis]])
+        expected = np.concatenate([stored(surveys.before, axis), stored(surveys.after, axis)])
         np.testing.assert_allclose(cloud[axis], expected, rtol=0, atol=1e-8)
 
 
@@ -444,11 +511,11 @@ def test_surveys_made_from_arrays_can_be_written(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.column_stack([cloud[a] for a in "xyz"])[:500], full, rtol=0, atol=0.0006)
 
 
-def test_cloud_is_written_in_chunks_without_a_seam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    surveys = make_surveys(tmp_path)
-    whole, _ = written(tmp_path, surveys, "whole.las")
-    monkeypatch.setattr("loda_pdal.io.las_writer.CHUNK", 333)
-    parts, _ = written(tmp_path, surveys, "parts.las")
+def test_cloud_is_written_in_parts_without_a_seam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, _ = written(tmp_path, make_surveys(tmp_path), "whole.las")
+    monkeypatch.setattr("loda_pdal.io.las_points.KEPT_BYTES", 0)
+    monkeypatch.setattr("loda_pdal.io.las_points.PART", 333)
+    parts, _ = written(tmp_path, make_surveys(tmp_path), "parts.las")
     assert whole.points.array.tobytes() == parts.points.array.tobytes()
 
 
@@ -465,6 +532,6 @@ def test_real_surveys_of_different_kinds_come_out_whole(tmp_path: Path, data_dir
     cloud, _ = written(tmp_path, surveys)
     n = len(surveys.before)
     for axis in "XYZ":
-        np.testing.assert_array_equal(cloud[axis][n:], surveys.after.source[axis])
-    np.testing.assert_array_equal(cloud["intensity"][:n], surveys.before.source["intensity"])
+        np.testing.assert_array_equal(cloud[axis][n:], stored(surveys.after, axis))
+    np.testing.assert_array_equal(cloud["intensity"][:n], stored(surveys.before, "intensity"))
     assert cloud.header.parse_crs().is_compound

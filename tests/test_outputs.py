@@ -93,7 +93,7 @@ def test_results_of_arrays_need_no_file(tmp_path: Path, surveys: Pair[Survey]) -
 
 def test_keep_frames_leaves_before_points_alone(tmp_path: Path, surveys: Pair[Survey]) -> None:
     paths = write_outputs(make_result(surveys), surveys, tmp_path / "out", keep_frames=True)
-    np.testing.assert_array_equal(laspy.read(paths["cloud"])["X"][:2000], surveys.before.source["X"])
+    np.testing.assert_array_equal(laspy.read(paths["cloud"])["X"][:2000], laspy.read(surveys.before.path)["X"])
 
 
 # Not overwriting

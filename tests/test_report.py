@@ -27,7 +27,7 @@ from loda_pdal.io.report import MEANINGS, ranked, render, write_report
 from loda_pdal.io.report_folder import read_report_data, rebuild_report
 from loda_pdal.io.report_pictures import Scene, object_pictures, round_length
 from loda_pdal.io.run_json import run_document
-from loda_pdal.io.summary import gps_day, summarise, survey_dates
+from loda_pdal.io.summary import summarise
 from loda_pdal.model.errors import InputError
 from loda_pdal.model.frame import LocalFrame
 from loda_pdal.model.labels import ChangeLabel, ObjectClass
@@ -109,9 +109,9 @@ def scene(reason: str = "Height +3.00 m, limit 0.05 m.") -> tuple[ChangeResult, 
     piece = GroundChangeRecord(
         1, ChangeLabel.DECREASED, rectangle(30, 0, 38, 6), -0.4, 0.03, 48.0, -19.2, "Lowered by 0.40 m."
     )
-    labels = clouds.map(lambda xyz: make_labels(len(xyz)))
+    labels = surveys.map(make_labels)
     for epoch, number in zip(labels, numbers, strict=True):
-        epoch.object[:] = number
+        epoch.of_voxel["ObjectId"][:-1] = number
     result = ChangeResult(
         objects,
         [piece],
@@ -441,9 +441,9 @@ def test_points_from_the_folder_are_means_of_voxels_however_they_are_read(
     cells = [rng.integers(0, 8, (n, 3)) for n in (3000, 2000)]
     xyz = Pair(*((cell + rng.uniform(0.05, 0.95, cell.shape)) * leaf_m for cell in cells))
     surveys = xyz.map(lambda points: Survey(points, LocalFrame((121_000, 486_000, 0))))
-    labels = xyz.map(lambda points: make_labels(len(points)))
+    labels = surveys.map(make_labels)
     for epoch in labels:
-        epoch.object[:] %= 3
+        epoch.of_voxel["ObjectId"] %= 3
     still = replace(make_registration(), T_after_before=np.eye(4))
     write_outputs(make_result(surveys, points=labels, registration=still), surveys, tmp_path)
     whole = read_report_data(tmp_path)
@@ -517,19 +517,6 @@ def test_summary_counts_and_figures() -> None:
     assert figures["lod95"]["median_m"] == pytest.approx(0.08)  # of 0.05, 0.08, 0.11
     assert figures["lod95"]["valid_share"] == pytest.approx(0.6)
     assert figures["registration"]["sigma_position_m"] == pytest.approx(np.sqrt(6e-4))
-
-
-def test_dates_come_from_absolute_gps_time_only(tmp_path: Path) -> None:
-    assert gps_day(315_964_800.0 - 1e9 + 18.0 + 86_400.0 * 0) is None  # 1990: no lidar survey
-    assert gps_day(1_261_872_018.0 - 1e9) == "2020-01-01"
-    assert gps_day(1_261_872_017.0 - 1e9) == "2019-12-31"
-    assert gps_day(float("nan")) is None
-    surveys = make_surveys(tmp_path)
-    assert survey_dates(surveys.before) == (None, None)  # seconds of an unknown week
-    source = surveys.before.source
-    source.header.global_encoding.gps_time_type = type(source.header.global_encoding.gps_time_type)(1)
-    source["gps_time"] = np.linspace(1_261_872_018.0 - 1e9, 1_262_044_818.0 - 1e9, len(surveys.before))
-    assert survey_dates(surveys.before) == ("2020-01-01", "2020-01-03")
 
 
 def test_pages_of_equal_data_are_equal(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ import numpy as np
 from loda_pdal.benchmark.calibrate import surveys_of
 from loda_pdal.benchmark.simulate import SimulationOptions, simulate_block
 from loda_pdal.model.lod_grid import LodGrid
-from loda_pdal.model.pair import Pair
 from loda_pdal.params import Parameters
 from loda_pdal.pipeline import fuse_epochs, into_frame, limit_of_detection, register_epochs, resolve
 
@@ -29,9 +28,8 @@ class Coverage(NamedTuple):
 def unchanged_grid(seed: int, parameters: Parameters) -> LodGrid:
     """LoD grid of a simulated street that was surveyed twice without edits, with fresh noise, drift and foliage."""
     surveys = surveys_of(simulate_block(seed, SimulationOptions(has_edits=False)))
-    points = Pair(surveys.before.xyz, surveys.after.xyz)
-    p = resolve(parameters, points)
-    fused = fuse_epochs(points, p)
+    p = resolve(parameters, surveys)
+    fused = fuse_epochs(surveys, p)
     registration = register_epochs(fused, p)
     return limit_of_detection(into_frame(fused, registration), registration, p)
 

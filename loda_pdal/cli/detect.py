@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from loda_pdal.cli import options, stopping, verbosity
+from loda_pdal.cli.ahead import METHOD, WRITERS, import_ahead
 from loda_pdal.cli.progress import Reporter, reporter_for
 
 if TYPE_CHECKING:
@@ -90,6 +91,7 @@ def _read(
     """Both surveys, after every check that can be made before long work."""
     from loda_pdal.io.las import read_epochs
 
+    import_ahead(*METHOD, *WRITERS)
     reporter.progress(0, 1, "reading the surveys")
     surveys = read_epochs(
         before,

@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pyogrio
-import pyogrio.raw
 import shapely
 
 from loda_pdal.io.plain import to_plain
@@ -151,6 +149,8 @@ def _write_layers(path: Path, result: ChangeResult, frame: LocalFrame, run: Mapp
 @contextmanager
 def _unhurried() -> Iterator[None]:
     """No waiting for the disk after each layer (ten times faster): who puts the file in place flushes it once."""
+    import pyogrio
+
     option = "OGR_SQLITE_SYNCHRONOUS"
     old = pyogrio.get_gdal_config_option(option)
     pyogrio.set_gdal_config_options({option: "OFF"})
@@ -200,8 +200,8 @@ def _blocks(result: ChangeResult) -> list[dict[str, Any]]:
         {
             "outline": result.block,
             "area_m2": float(result.block.area),
-            "points_before": len(result.points.before.change),
-            "points_after": len(result.points.after.change),
+            "points_before": len(result.points.before),
+            "points_after": len(result.points.after),
             "n_objects": len(result.objects),
             "n_changes": len(result.changes),
         }
@@ -226,6 +226,8 @@ def _write_layer(
     geometry_type: str = "MultiPolygon",
 ) -> None:
     """One layer; typed columns even where it has no rows or all of a column is NULL."""
+    import pyogrio.raw
+
     values = [[column.value(record) for record in records] for column in columns]
     masks = [np.array([_is_unknown(value) for value in column], dtype=bool) for column in values]
     data = [_array(c.kind, v, m) for c, v, m in zip(columns, values, masks, strict=True)]

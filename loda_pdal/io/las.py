@@ -1,42 +1,38 @@
 """Reading two surveys from LAS, LAZ or COPC files into one local frame, with every check that can spare a long run.
 
-Headers are judged first: a run that cannot succeed stops before a point is decompressed.
+Headers are judged first: a run that cannot succeed stops before a point is decompressed. Then every point is looked at
+once. Points are not kept (see `LasFile`): who needs them later goes through the file again.
 """
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import laspy
 import numpy as np
-from laspy.errors import LaspyException
-from lazrs import LazrsError
 
 from loda_pdal.io.crs import DeclaredCrs, MapCrs, common_crs, declared_crs
+from loda_pdal.io.gps_time import gps_day
+from loda_pdal.io.las_points import LasFile, broken, reading, unreadable
 from loda_pdal.io.memory import check_memory, estimate_memory
-from loda_pdal.model.cloud import ORIGIN_STEP, FloatArray, Int64Array
+from loda_pdal.model.cloud import ORIGIN_STEP, FloatArray
 from loda_pdal.model.errors import InputError
+from loda_pdal.model.extent import Extent
 from loda_pdal.model.frame import LocalFrame
-from loda_pdal.model.pair import Pair
+from loda_pdal.model.pair import Pair, at_once
 from loda_pdal.model.survey import Survey
 
 MIN_OVERLAP = 0.20
 """Smallest share of the smaller survey's plan that the other must cover."""
 
-OVERLAP_CELL_M = 10.0
-"""Edge of the plan cells in which overlap is counted."""
-
 MAX_EXTENT_M = 100_000.0
 MIN_DENSITY = 0.01
 _SMALL_AREA_M2 = 10_000.0
 _SMALLEST_HEADER = 227
-_POINTS_AT_ONCE = 500_000
-"""Decompressing holds the interpreter lock: in pieces, so that a run can be stopped in between."""
-
-_UNREADABLE = (LaspyException, LazrsError, ValueError, EOFError, struct.error, OverflowError, MemoryError, IndexError)
 
 
 @dataclass(frozen=True)
@@ -125,15 +121,10 @@ def inspect(path: str | Path) -> SurveyInfo:
     """Header of a LAS, LAZ or COPC file, checked for being whole; `InputError` otherwise."""
     path = Path(path)
     n_bytes = _file_size(path)
-    try:
-        with laspy.open(path) as reader:
-            header = reader.header
-            info = _info(path, n_bytes, header)
-            point_start = int(header.offset_to_point_data)
-    except OSError as error:
-        raise _unreadable(path, error) from error
-    except _UNREADABLE as error:
-        raise _broken(path, str(error)) from error
+    with reading(path), laspy.open(path) as reader:
+        header = reader.header
+        info = _info(path, n_bytes, header)
+        point_start = int(header.offset_to_point_data)
     _check_header(info)
     _check_whole(path, info, point_start, header.point_format.size)
     return info
@@ -179,7 +170,7 @@ def read_epochs(
     Returns
     -------
     Pair of Survey
-        Local metres from a common origin; ``source`` holds the laspy record with every dimension.
+        Local metres from a common origin; their `LasFile` as ``source`` hands out every dimension.
     """
     infos = Pair(inspect(before_path), inspect(after_path))
     crs = common_crs(
@@ -187,43 +178,72 @@ def read_epochs(
     )
     _check_headers(infos, crs)
     check_memory(_memory_needed(infos, crs, leaf_m), max_memory)
-    sources = infos.map(_read_points)
-    xyz = sources.join(infos, _map_coordinates)
-    frame = common_frame(xyz, crs)
-    local = xyz.map(frame.to_local)
-    check_coverage(infos.map(_short_name), local)
-    return Pair(
-        Survey(local.before, frame, infos.before.path, sources.before, crs.notes.before),
-        Survey(local.after, frame, infos.after.path, sources.after, crs.notes.after),
-    )
+    files = infos.map(lambda info: LasFile(Path(info.path), info.n_points))
+    frame = common_frame(infos.map(lambda info: np.array(info.low if info.has_bounds else (0.0, 0.0, 0.0))), crs)
+    found = at_once(lambda file: _look_through(file, frame), files)
+    true_frame = common_frame(found.map(lambda each: each.low), crs)
+    if true_frame != frame:  # a header's bounds are wrong
+        frame = true_frame
+        found = at_once(lambda file: _look_through(file, frame), files)
+    check_coverage(infos.map(_short_name), found.map(lambda each: each.extent))
+
+    def survey(file: LasFile, seen: _Found, notes: list[str]) -> Survey:
+        return Survey(file, frame, str(file.path), notes, seen.dates, file.n_bytes, seen.sha256, seen.extent)
+
+    return Pair(*(survey(*each) for each in zip(files, found, crs.notes, strict=True)))
 
 
-def common_frame(xyz: Pair[FloatArray], crs: MapCrs) -> LocalFrame:
-    """The local frame of two clouds in full map coordinates, (n, 3) each."""
-    low = np.minimum(xyz.before[:, :2].min(axis=0), xyz.after[:, :2].min(axis=0))
-    x, y = (int(v) for v in np.floor(low / ORIGIN_STEP) * ORIGIN_STEP)
+def common_frame(low: Pair[FloatArray], crs: MapCrs) -> LocalFrame:
+    """The local frame of two clouds whose lowest full map coordinates are ``low``, (3,) each."""
+    x, y = (int(v) for v in np.floor(np.minimum(low.before, low.after)[:2] / ORIGIN_STEP) * ORIGIN_STEP)
     return LocalFrame((x, y, 0), crs.unit_xy_m, crs.unit_z_m, crs.wkt)
 
 
-def check_coverage(names: Pair[str], local: Pair[FloatArray]) -> None:
-    """`InputError` where two clouds (n, 3), m, spread absurdly for their number of points, or hardly overlap."""
-    for name, points in zip(names, local, strict=True):
-        _check_extent(name, len(points), np.ptp(points, axis=0))
-    share = plan_overlap(local.before, local.after)
+def check_coverage(names: Pair[str], extents: Pair[Extent]) -> None:
+    """`InputError` where two clouds spread absurdly for their number of points, or hardly overlap."""
+    for name, extent in zip(names, extents, strict=True):
+        _check_extent(name, extent.n, extent.size_m)
+    share = extents.before.overlap(extents.after)
     if share < MIN_OVERLAP:
         raise _no_overlap(names, f"they share {100 * share:.0f} % of the smaller one's area in plan")
 
 
-def plan_overlap(before: FloatArray, after: FloatArray) -> float:
-    """Share of the smaller cloud's occupied plan cells of `OVERLAP_CELL_M` that the other occupies too, 0 to 1."""
-    a, b = _plan_cells(before), _plan_cells(after)
-    return len(np.intersect1d(a, b, assume_unique=True)) / min(len(a), len(b))
+@dataclass(frozen=True)
+class _Found:
+    """What a first look at all points of a file finds.
+
+    ``low`` are the lowest full map coordinates (3,), ``dates`` the first and last day of measurement.
+    """
+
+    extent: Extent
+    low: FloatArray
+    dates: tuple[str | None, str | None]
+    sha256: str
 
 
-def _plan_cells(xyz: FloatArray) -> Int64Array:
-    """Occupied plan cells as sorted unique keys."""
-    cells = np.floor(xyz[:, :2] / OVERLAP_CELL_M).astype(np.int64)
-    return np.unique((cells[:, 0] << 32) + cells[:, 1])
+def _look_through(file: LasFile, frame: LocalFrame) -> _Found:
+    """Decompress everything once: damage shows here, and not after long work."""
+    low, times = np.full(3, np.inf), [np.inf, -np.inf]
+    is_dated = _has_absolute_time(file.header)
+
+    def local_parts() -> Iterator[FloatArray]:
+        for record in file.records():
+            xyz = file.map_coordinates(record)
+            for axis in range(3):
+                low[axis] = min(low[axis], xyz[:, axis].min())
+            if is_dated:
+                gps_time = np.asarray(record["gps_time"])
+                times[:] = min(times[0], float(gps_time.min())), max(times[1], float(gps_time.max()))
+            yield frame.to_local(xyz)
+
+    extent = Extent.of(local_parts())
+    return _Found(extent, low, (gps_day(times[0]), gps_day(times[1])), file.sha256())
+
+
+def _has_absolute_time(header: Any) -> bool:
+    """Whether GPS times say the day; otherwise they are seconds of an unknown week."""
+    has_time = "gps_time" in set(header.point_format.standard_dimension_names)
+    return has_time and bool(header.global_encoding.gps_time_type.value)
 
 
 def _short_name(info: SurveyInfo) -> str:
@@ -241,7 +261,7 @@ def _file_size(path: Path) -> int:
     except FileNotFoundError as error:
         raise InputError(f"{path}: there is no such file.", "Check the path.", "input-missing") from error
     except OSError as error:
-        raise _unreadable(path, error) from error
+        raise unreadable(path, error) from error
     if n_bytes == 0:
         raise InputError(f"{path}: the file is empty (0 bytes).", "Copy or download it again.", "input-truncated")
     if start != b"LASF":
@@ -257,20 +277,6 @@ def _file_size(path: Path) -> int:
             "input-truncated",
         )
     return n_bytes
-
-
-def _unreadable(path: Path, error: OSError) -> InputError:
-    return InputError(
-        f"{path}: cannot be read ({error.strerror or error}).", "Check the file's permissions.", "input-unreadable"
-    )
-
-
-def _broken(path: Path, reason: str) -> InputError:
-    return InputError(
-        f"{path}: is damaged or cut off ({reason or 'unexpected end'}).",
-        "Copy or download it again, and check it with `pdal info`.",
-        "input-truncated",
-    )
 
 
 def _info(path: Path, n_bytes: int, header: Any) -> SurveyInfo:
@@ -317,14 +323,14 @@ def _check_whole(path: Path, info: SurveyInfo, point_start: int, point_size: int
         needed = point_start + info.n_points * point_size
         if info.n_bytes < needed:
             held = max(0, (info.n_bytes - point_start) // point_size)
-            raise _broken(path, f"the header promises {info.n_points} points, the file holds {held}")
+            raise broken(path, f"the header promises {info.n_points} points, the file holds {held}")
         return
     with path.open("rb") as file:
         file.seek(point_start)
         table = file.read(8)
     table_start = struct.unpack("<q", table)[0] if len(table) == 8 else info.n_bytes
     if table_start >= info.n_bytes:
-        raise _broken(path, "its table of compressed chunks is missing")
+        raise broken(path, "its table of compressed chunks is missing")
 
 
 def _check_headers(infos: Pair[SurveyInfo], crs: MapCrs) -> None:
@@ -359,45 +365,6 @@ def _check_extent(name: str, n_points: int, size_m: FloatArray) -> None:
             f"{name}: {n_points} points spread over {size_m[0]:.0f} m by {size_m[1]:.0f} m (height {size_m[2]:.0f} m).",
             "Remove stray points (for example with filters.crop), check the CRS and its unit, or cut out the area.",
             "input-extent",
-        )
-
-
-def _read_points(info: SurveyInfo) -> Any:
-    """All points of a file, as laspy's record."""
-    path = Path(info.path)
-    try:
-        with laspy.open(path) as reader:
-            points = laspy.ScaleAwarePointRecord.zeros(info.n_points, header=reader.header)
-            n_read = 0
-            for part in reader.chunk_iterator(_POINTS_AT_ONCE):
-                points.array[n_read : n_read + len(part)] = part.array
-                n_read += len(part)
-    except OSError as error:
-        raise _unreadable(path, error) from error
-    except _UNREADABLE as error:
-        raise _broken(path, str(error)) from error
-    if n_read != info.n_points:
-        raise _broken(path, f"the header promises {info.n_points} points, {n_read} could be read")
-    return laspy.LasData(reader.header, points)
-
-
-def _map_coordinates(source: Any, info: SurveyInfo) -> FloatArray:
-    """Full map coordinates (n, 3) of a laspy record."""
-    xyz = map_coordinates(source.points, info.scale, info.offset)
-    if not np.all(np.isfinite(xyz)):
-        raise InputError(
-            f"{info.path}: holds coordinates that are not finite.",
-            "Repair the scale and offset of the header, or write the file again from its source.",
-            "input-not-finite",
-        )
-    return xyz
-
-
-def map_coordinates(points: Any, scale: Any, offset: Any) -> FloatArray:
-    """Full map coordinates (n, 3) of laspy points: stored integers times scale plus offset; not checked."""
-    with np.errstate(over="ignore"):
-        return np.column_stack(
-            [points[axis] * float(s) + float(o) for axis, s, o in zip("XYZ", scale, offset, strict=True)]
         )
 
 

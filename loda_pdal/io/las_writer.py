@@ -5,11 +5,13 @@ The output is LAS 1.4 with a point format of 6 or higher, because the older form
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import laspy
 import numpy as np
@@ -19,6 +21,7 @@ from pyproj import CRS
 from pyproj.enums import WktVersion
 
 import loda_pdal
+from loda_pdal.io.las_points import LasFile, map_coordinates
 from loda_pdal.model import dimensions as dims
 from loda_pdal.model.cloud import FloatArray
 from loda_pdal.model.errors import OutputError
@@ -30,7 +33,7 @@ from loda_pdal.model.transform import transform_points
 
 logger = logging.getLogger(__name__)
 
-CHUNK = 1_000_000
+_FIRST_MODERN_FORMAT = 6
 _INT32_MAX = 2**31 - 1
 _SCAN_ANGLE_STEP_DEG = 0.006
 _LEGACY_OVERLAP_CLASS = 12
@@ -77,12 +80,11 @@ def write_cloud(
             "Use laz, and convert it with `pdal translate changes.laz changes.copc.laz` where COPC is wanted.",
             "cloud-format",
         )
-    sources = surveys.map(_source)
     epochs = Pair(
-        _Epoch(0, surveys.before, sources.before, labels.before, None if keep_frames else T_after_before),
-        _Epoch(1, surveys.after, sources.after, labels.after, None),
+        _Epoch(0, surveys.before, labels.before, None if keep_frames else T_after_before),
+        _Epoch(1, surveys.after, labels.after, None),
     )
-    extras = _extra_dimensions(sources)
+    extras = _extra_dimensions(epochs.map(lambda epoch: epoch.header))
     header = _header(epochs, extras, surveys.after.frame)
     is_compressed = path.suffix.lower() == ".laz"
     backend = laspy.LazBackend.LazrsParallel if is_compressed else None
@@ -92,65 +94,85 @@ def write_cloud(
                 writer.write_points(_points(epoch, part, extras, header))
 
 
+class _Part(NamedTuple):
+    """Some points of an epoch: the number of the first, their laspy record, and local coordinates (k, 3), m."""
+
+    start: int
+    record: Any
+    xyz: FloatArray
+
+
 @dataclass(frozen=True)
 class _Epoch:
     """One epoch on its way out; ``T_after_before`` is None where the points stay."""
 
     number: int
     survey: Survey
-    source: Any
     labels: PointLabels
     T_after_before: FloatArray | None
 
-    def parts(self) -> Iterator[slice]:
-        for start in range(0, len(self.survey), CHUNK):
-            yield slice(start, min(start + CHUNK, len(self.survey)))
+    @cached_property
+    def header(self) -> Any:
+        """The laspy header of the input; a plain one for a survey made from arrays."""
+        if isinstance(self.survey.source, LasFile):
+            return self.survey.source.header
+        header = laspy.LasHeader(point_format=6, version="1.4")
+        header.scales = np.full(3, 0.001)
+        header.offsets = np.floor(self.survey.frame.to_map(self.survey.extent.low)) if len(self.survey) else np.zeros(3)
+        return header
 
-    def map_coordinates(self, part: slice) -> FloatArray:
-        """Full map coordinates (k, 3) as they are to be written."""
+    def parts(self) -> Iterator[_Part]:
+        """All points in their order, read again where they are in a file."""
+        source, start = self.survey.source, 0
+        if isinstance(source, LasFile):
+            for record in source.records():
+                yield _Part(start, record, self.survey.frame.to_local(source.map_coordinates(record)))
+                start += len(record)
+        else:
+            for xyz in self.survey.parts():
+                record = laspy.ScaleAwarePointRecord.zeros(len(xyz), header=self.header)
+                _set_coordinates(record, _steps(self.survey.frame.to_map(xyz), self.header))
+                yield _Part(start, record, xyz)
+                start += len(xyz)
+
+    def stored(self, part: _Part, header: Any) -> npt.NDArray[np.int32]:
+        """Coordinates as integers (k, 3) in the steps of ``header``: the input's own where they need no change."""
         if self.T_after_before is not None:
-            return self.survey.frame.to_map(transform_points(self.T_after_before, self.survey.xyz[part]))
-        points, scale, offset = self.source.points[part], self.source.header.scales, self.source.header.offsets
-        return np.column_stack([points[axis] * s + o for axis, s, o in zip("XYZ", scale, offset, strict=True)])
-
-    def stored(self, part: slice, header: Any) -> npt.NDArray[np.int32]:
-        """Coordinates as stored integers (k, 3): the input's own where they need no change."""
-        own = self.source.header
-        is_same = np.array_equal(own.scales, header.scales) and np.array_equal(own.offsets, header.offsets)
-        if self.T_after_before is None and is_same:
-            points = self.source.points[part]
-            return np.column_stack([np.asarray(points[axis]) for axis in "XYZ"])
-        rounded = np.rint((self.map_coordinates(part) - header.offsets) / header.scales)
-        return np.asarray(rounded, dtype=np.int32)
+            return _steps(self.survey.frame.to_map(transform_points(self.T_after_before, part.xyz)), header)
+        own = self.header
+        if np.array_equal(own.scales, header.scales) and np.array_equal(own.offsets, header.offsets):
+            return np.column_stack([np.asarray(part.record[axis]) for axis in "XYZ"])
+        return _steps(map_coordinates(part.record, own.scales, own.offsets), header)
 
     def bounds(self) -> FloatArray:
-        """Lowest and highest map coordinates, (2, 3); empty epochs have none, (0, 3)."""
-        parts = [self.map_coordinates(part) for part in self.parts()]
-        return np.array([f(p, axis=0) for p in parts for f in (np.min, np.max)]).reshape(-1, 3)
+        """Two corners (2, 3) of a box that holds all points as they are to be written; empty epochs have none."""
+        if len(self.survey) == 0:
+            return np.empty((0, 3))
+        extent, T = self.survey.extent, self.T_after_before
+        corners = np.array(list(itertools.product(*zip(extent.low, extent.high, strict=True))))
+        corners = self.survey.frame.to_map(corners if T is None else transform_points(T, corners))
+        return np.array([corners.min(axis=0), corners.max(axis=0)])
 
 
-def _source(survey: Survey) -> Any:
-    """The laspy record of a survey; a plain one for a survey made from arrays."""
-    if survey.source is not None:
-        return survey.source
-    header = laspy.LasHeader(point_format=6, version="1.4")
-    full = survey.frame.to_map(survey.xyz)
-    header.scales = np.full(3, 0.001)
-    header.offsets = np.floor(full.min(axis=0)) if len(full) else np.zeros(3)
-    data = laspy.LasData(header)
-    data.points = laspy.ScaleAwarePointRecord.zeros(len(full), header=header)
+def _steps(full: FloatArray, header: Any) -> npt.NDArray[np.int32]:
+    """Full map coordinates (k, 3) as the integers that a file with this header stores."""
+    steps = full - header.offsets
+    steps /= header.scales
+    return np.asarray(np.rint(steps), dtype=np.int32)
+
+
+def _set_coordinates(record: Any, stored: npt.NDArray[np.int32]) -> None:
     for column, axis in enumerate("XYZ"):
-        data.points[axis] = np.rint((full[:, column] - header.offsets[column]) / header.scales[column])
-    return data
+        record.array[axis] = stored[:, column]
 
 
 def _header(epochs: Pair[_Epoch], extras: list[_Extra], frame: LocalFrame) -> Any:
-    names = {name for epoch in epochs for name in epoch.source.point_format.dimension_names}
+    names = {name for epoch in epochs for name in epoch.header.point_format.dimension_names}
     header = laspy.LasHeader(point_format=_point_format(names), version="1.4")
     header.scales, header.offsets = _scaling(epochs)
     header.system_identifier = "MERGE"
     header.generating_software = f"loda-pdal {loda_pdal.__version__}"
-    after, before = epochs.after.source.header, epochs.before.source.header
+    after, before = epochs.after.header, epochs.before.header
     header.global_encoding.gps_time_type = after.global_encoding.gps_time_type
     if before.global_encoding.gps_time_type != after.global_encoding.gps_time_type:
         logger.warning("The surveys count GPS time differently; each point keeps its own number.")
@@ -184,7 +206,7 @@ def _point_format(names: set[str]) -> int:
 
 def _scaling(epochs: Pair[_Epoch]) -> tuple[FloatArray, FloatArray]:
     """Scale and offset, (3,) each: the shared ones, else the finest scale and an offset that holds every point."""
-    before, after = epochs.before.source.header, epochs.after.source.header
+    before, after = epochs.before.header, epochs.after.header
     bounds = np.vstack([epochs.before.bounds(), epochs.after.bounds()])
     scale = np.minimum(np.abs(before.scales), np.abs(after.scales))
     offset = np.array(after.offsets, dtype=float)
@@ -220,9 +242,9 @@ class _Extra:
     fill: Any
 
 
-def _extra_dimensions(sources: Pair[Any]) -> list[_Extra]:
+def _extra_dimensions(headers: Pair[Any]) -> list[_Extra]:
     """Union of the extra dimensions of both inputs, those of the before epoch first."""
-    before, after = _declared(sources.before), _declared(sources.after)
+    before, after = _declared(headers.before), _declared(headers.after)
     extras = []
     for name, b in before.items():
         a = after.pop(name, None)
@@ -231,20 +253,20 @@ def _extra_dimensions(sources: Pair[Any]) -> list[_Extra]:
         elif _is_stored_alike(b, a):
             extras.append(_copied(b, Pair(name, name)))
         elif b.num_elements == a.num_elements:
-            extras.append(_promoted(sources, name, b.num_elements))
+            extras.append(_promoted(headers, name, b.num_elements))
         else:
             other = _free_name(name, {*before, *after})
             extras += [_copied(b, Pair(name, None)), _copied(a, Pair(None, name), other)]
     return extras + [_copied(a, Pair(None, name)) for name, a in after.items()]
 
 
-def _declared(source: Any) -> dict[str, Any]:
+def _declared(header: Any) -> dict[str, Any]:
     """The extra dimensions of an input by name, less those that ours replace; with their no-data values."""
-    structs = [struct for vlr in source.header.vlrs.get("ExtraBytesVlr") for struct in vlr.extra_bytes_structs]
+    structs = [struct for vlr in header.vlrs.get("ExtraBytesVlr") for struct in vlr.extra_bytes_structs]
     no_data = {struct.format_name(): struct.no_data for struct in structs if struct.data_type != 0}
     return {
         d.name: d._replace(no_data=no_data.get(d.name))  # laspy reads the rest of the declaration, but not this
-        for d in source.point_format.extra_dimensions
+        for d in header.point_format.extra_dimensions
         if d.name.casefold() not in _OWN_NAMES
     }
 
@@ -262,9 +284,10 @@ def _copied(info: Any, names: Pair[str | None], name: str | None = None) -> _Ext
     return _Extra(params, names, True, fill)
 
 
-def _promoted(sources: Pair[Any], name: str, n_elements: int) -> _Extra:
+def _promoted(headers: Pair[Any], name: str, n_elements: int) -> _Extra:
     """A dimension that both inputs have but store differently: written in a type that holds both."""
-    base = np.result_type(*(np.asarray(source.points[name][:0]).dtype for source in sources))
+    empty = headers.map(lambda header: laspy.ScaleAwarePointRecord.zeros(0, header=header))
+    base = np.result_type(*(np.asarray(record[name]).dtype for record in empty))
     dtype = np.dtype(base) if n_elements == 1 else np.dtype((base, (n_elements,)))
     return _Extra(laspy.ExtraBytesParams(name, dtype), Pair(name, name), False, np.nan if base.kind == "f" else 0)
 
@@ -277,32 +300,35 @@ def _free_name(name: str, taken: set[str]) -> str:
     return candidate
 
 
-def _points(epoch: _Epoch, part: slice, extras: list[_Extra], header: Any) -> Any:
+def _points(epoch: _Epoch, part: _Part, extras: list[_Extra], header: Any) -> Any:
     """The output record of some points of one epoch."""
-    source = epoch.source.points[part]
-    record = laspy.ScaleAwarePointRecord.zeros(len(source), header=header)
-    stored = epoch.stored(part, header)
-    for column, axis in enumerate("XYZ"):
-        record.array[axis] = stored[:, column]
-    _copy_standard(source, record)
+    record = laspy.ScaleAwarePointRecord.zeros(len(part.record), header=header)
+    _set_coordinates(record, epoch.stored(part, header))
+    _copy_standard(part.record, record)
     for extra in extras:
         name = extra.names.before if epoch.number == 0 else extra.names.after
-        _copy_extra(source, record, extra, name)
-    _set_labels(record, epoch, part)
+        _copy_extra(part.record, record, extra, name)
+    found = epoch.labels.of_part(part.start, part.xyz)
+    record.array["classification"] = found[dims.CLASSIFICATION.name]
+    for dimension in dims.EXTRA_DIMENSIONS:
+        record.array[dimension.name] = epoch.number if dimension is dims.EPOCH else found[dimension.name]
     return record
 
 
 def _copy_standard(source: Any, record: Any) -> None:
     """The fields of the LAS standard; those of formats 0 to 5 in the units and bits of formats 6 and up."""
+    if source.point_format.id >= _FIRST_MODERN_FORMAT:  # all of these pack their flags alike
+        for name in laspy.PointFormat(source.point_format.id).dtype().names:
+            if name not in _SET_APART and name in record.array.dtype.names:
+                record.array[name] = source.array[name]
+        return
     available = set(source.point_format.standard_dimension_names)
     for name in record.point_format.standard_dimension_names:
         if name in available and name not in _SET_APART:
             record[name] = np.asarray(source[name])
-    if "scan_angle_rank" in available:
-        degrees = np.asarray(source["scan_angle_rank"], dtype=float)
-        record["scan_angle"] = np.rint(degrees / _SCAN_ANGLE_STEP_DEG).astype(np.int16)
-    if "overlap" not in available:
-        record["overlap"] = np.asarray(source["classification"]) == _LEGACY_OVERLAP_CLASS
+    degrees = np.asarray(source["scan_angle_rank"], dtype=float)
+    record["scan_angle"] = np.rint(degrees / _SCAN_ANGLE_STEP_DEG).astype(np.int16)
+    record["overlap"] = np.asarray(source["classification"]) == _LEGACY_OVERLAP_CLASS
 
 
 def _copy_extra(source: Any, record: Any, extra: _Extra, name: str | None) -> None:
@@ -313,19 +339,3 @@ def _copy_extra(source: Any, record: Any, extra: _Extra, name: str | None) -> No
         column[...] = source.array[name]
     else:
         column[...] = np.asarray(source[name])
-
-
-def _set_labels(record: Any, epoch: _Epoch, part: slice) -> None:
-    labels = epoch.labels
-    record["classification"] = labels.classification[part]
-    for dimension, values in (
-        (dims.HEIGHT, labels.height),
-        (dims.LOD95, labels.lod95),
-        (dims.SUPERPOINT, labels.superpoint),
-        (dims.INSTANCE, labels.instance),
-        (dims.OBJECT, labels.object),
-        (dims.CHANGE, labels.change),
-        (dims.CONFIDENCE, labels.confidence),
-    ):
-        record.array[dimension.name] = values[part]
-    record.array[dims.EPOCH.name] = epoch.number

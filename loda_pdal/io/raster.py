@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from rasterio.crs import CRS
-from rasterio.io import MemoryFile
-from rasterio.transform import Affine
 
 from loda_pdal.model.cloud import Float32Array, FloatArray
 from loda_pdal.model.frame import LocalFrame
 from loda_pdal.model.lod_grid import LodGrid
 from loda_pdal.model.transform import invert, transform_points
+
+if TYPE_CHECKING:
+    from rasterio.transform import Affine
 
 BANDS = (
     ("LoD95, plan maximum over valid cells", "m"),
@@ -35,6 +36,9 @@ def write_lod_raster(path: Path, lod: LodGrid, T_after_frame: FloatArray, frame:
     frame : LocalFrame
         From local metres to map coordinates, and the CRS.
     """
+    from rasterio.crs import CRS
+    from rasterio.io import MemoryFile
+
     bands, corner = plan_raster(lod, T_after_frame)
     count, height, width = bands.shape
     with MemoryFile() as memory:  # on a full disk GDAL's own writing can crash; a file of bytes fails cleanly
@@ -98,6 +102,8 @@ def _columns(lod: LodGrid) -> tuple[Float32Array, FloatArray]:
 
 
 def _placement(corner: tuple[float, float], cell_m: float, frame: LocalFrame) -> Affine:
+    from rasterio.transform import Affine
+
     west, north, _ = frame.to_map(np.array([[*corner, 0.0]]))[0]
     pixel = cell_m / frame.unit_xy_m
     return Affine(pixel, 0.0, west, 0.0, -pixel, north)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import platform
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import Any
 
 import loda_pdal
@@ -64,19 +62,11 @@ def package_versions() -> dict[str, str]:
     return found
 
 
-def sha256(path: Path) -> str:
-    """SHA-256 of a file, hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def _input(survey: Survey) -> dict[str, Any]:
-    path = Path(survey.path) if survey.path else None
-    is_file = path is not None and path.is_file()
     return {
         "path": survey.path or None,
-        "bytes": path.stat().st_size if path is not None and is_file else None,
-        "sha256": sha256(path) if path is not None and is_file else None,
+        "bytes": survey.n_bytes,
+        "sha256": survey.sha256,
         "points": len(survey),
         "notes": list(survey.notes),
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +14,6 @@ from loda_pdal.model.pair import Pair
 from loda_pdal.model.records import ChangeResult, GroundChangeRecord, ObjectRecord
 from loda_pdal.model.registration import Registration
 from loda_pdal.model.survey import Survey
-
-GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
-GPS_OFFSET_S = 1e9
-"""LAS "adjusted standard" GPS time is seconds since `GPS_EPOCH` minus this."""
-GPS_LEAP_S = 18.0
-"""Seconds that GPS time is ahead of UTC since 2017."""
 
 FEW_VALID = 0.5
 """Share of cells with a limit of detection below which the reader is told."""
@@ -102,7 +95,7 @@ def lod_figures(lod: LodGrid) -> dict[str, Any]:
 
 def survey_figures(survey: Survey) -> dict[str, Any]:
     """Name, size, dates and notes of one survey."""
-    first, last = survey_dates(survey)
+    first, last = survey.dates
     return {
         "file": Path(survey.path).name or "array",
         "points": len(survey),
@@ -110,28 +103,6 @@ def survey_figures(survey: Survey) -> dict[str, Any]:
         "last_date": last,
         "notes": list(survey.notes),
     }
-
-
-def survey_dates(survey: Survey) -> tuple[str | None, str | None]:
-    """First and last day of measurement (ISO dates, UTC), from GPS time where the file dates it absolutely."""
-    header = getattr(survey.source, "header", None)
-    if header is None or "gps_time" not in set(header.point_format.standard_dimension_names):
-        return None, None
-    if not header.global_encoding.gps_time_type.value or not len(survey):  # 0 is seconds of an unknown week
-        return None, None
-    times = np.asarray(survey.source["gps_time"])
-    return gps_day(float(times.min())), gps_day(float(times.max()))
-
-
-def gps_day(adjusted_s: float) -> str | None:
-    """ISO date of an adjusted standard GPS time in seconds; None where it cannot be a lidar survey's."""
-    if not np.isfinite(adjusted_s):
-        return None
-    try:
-        day = (GPS_EPOCH + timedelta(seconds=adjusted_s + GPS_OFFSET_S - GPS_LEAP_S)).date()
-    except OverflowError:
-        return None
-    return day.isoformat() if 1995 <= day.year <= datetime.now(tz=UTC).year + 1 and adjusted_s != 0 else None
 
 
 def few_valid_cells(lod: dict[str, Any]) -> list[str]:

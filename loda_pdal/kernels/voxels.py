@@ -65,6 +65,28 @@ def number_distinct(key: Any, first: int, table: Any, distinct: Any, n_distinct:
 
 
 @njit(nogil=True, cache=True)
+def add_points(number: Any, xyz: Any, total: Any, count: Any) -> None:
+    """Add points to the sums of their voxels.
+
+    Parameters
+    ----------
+    number : (n,) int32
+        Voxel of each point.
+    xyz : (n, 3) float64, m
+    total : (m, 3) float64, m
+        Sums of the coordinates of each voxel.
+    count : (m,) int32
+        Points of each voxel.
+    """
+    for p in range(len(number)):
+        v = number[p]
+        total[v, 0] += xyz[p, 0]
+        total[v, 1] += xyz[p, 1]
+        total[v, 2] += xyz[p, 2]
+        count[v] += 1
+
+
+@njit(nogil=True, cache=True)
 def fill_table(table: Any, distinct: Any, n_distinct: int) -> None:
     """Enter the first ``n_distinct`` of ``distinct`` into an empty hash table."""
     for d in range(n_distinct):

@@ -25,7 +25,9 @@ ORIGIN_STEP = 1000
 
 def to_local_grid(xyz: FloatArray) -> FloatArray:
     """Round local coordinates, (n, 3) in metres, to whole multiples of `LOCAL_GRID`."""
-    rounded: FloatArray = np.round(xyz / LOCAL_GRID) * LOCAL_GRID
+    rounded: FloatArray = xyz / LOCAL_GRID
+    np.rint(rounded, out=rounded)
+    rounded *= LOCAL_GRID
     return rounded
 
 
@@ -56,6 +58,6 @@ class VoxelCloud:
 
     def subset(self, is_kept: BoolArray) -> VoxelCloud:
         """The voxels where ``is_kept``, (m,) bool; raw points of the others get voxel -1."""
-        new_idx = np.where(is_kept, np.cumsum(is_kept) - 1, -1).astype(np.int32)
-        voxel_idx = np.where(self.voxel_idx >= 0, new_idx[self.voxel_idx], -1).astype(np.int32)
-        return VoxelCloud(self.xyz[is_kept], self.n_raw[is_kept], voxel_idx)
+        new_idx = np.full(len(self) + 1, -1, dtype=np.int32)  # the last is for points without a voxel, -1
+        new_idx[:-1][is_kept] = np.arange(np.count_nonzero(is_kept), dtype=np.int32)
+        return VoxelCloud(self.xyz[is_kept], self.n_raw[is_kept], new_idx[self.voxel_idx])

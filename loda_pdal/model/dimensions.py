@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 
 class Dimension(NamedTuple):
     """One per-point dimension: its name, NumPy dtype, value where unknown, and meaning."""
@@ -27,3 +29,6 @@ CONFIDENCE = Dimension("ChangeConfidence", "float32", float("nan"), "0 to 1; NaN
 DIMENSIONS = (EPOCH, CLASSIFICATION, HEIGHT, LOD95, SUPERPOINT, INSTANCE, OBJECT, CHANGE, CONFIDENCE)
 EXTRA_DIMENSIONS = tuple(d for d in DIMENSIONS if d is not CLASSIFICATION)
 """Those that are no standard LAS field and travel as extra bytes."""
+
+FOUND = np.dtype([(d.name, d.dtype) for d in DIMENSIONS if d is not EPOCH])
+"""What a run finds for a point, as one record of an array."""

@@ -35,7 +35,9 @@ class LocalFrame:
 
     def to_local(self, xyz: FloatArray) -> FloatArray:
         """Local metres (n, 3), on the local grid, of full map coordinates (n, 3)."""
-        return to_local_grid((xyz - np.array(self.origin, dtype=float)) * self.scale)
+        local = xyz - np.array(self.origin, dtype=float)
+        local *= self.scale
+        return to_local_grid(local)
 
     def to_map(self, xyz: FloatArray) -> FloatArray:
         """Full map coordinates (n, 3) of local metres (n, 3)."""

@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from loda_pdal.model.cloud import ByteArray, Float32Array, FloatArray
+from loda_pdal.model.cloud import ByteArray, Float32Array, FloatArray, IntArray
+from loda_pdal.model.dimensions import (
+    CHANGE,
+    CLASSIFICATION,
+    CONFIDENCE,
+    HEIGHT,
+    INSTANCE,
+    LOD95,
+    OBJECT,
+    SUPERPOINT,
+    Dimension,
+)
 from loda_pdal.model.labels import ChangeLabel, ObjectClass
 from loda_pdal.model.lod_grid import LodGrid
 from loda_pdal.model.pair import Pair
 from loda_pdal.model.registration import Registration
+from loda_pdal.model.survey import Survey
 from loda_pdal.params import Parameters
 
 UIntArray = npt.NDArray[np.uint32]
@@ -85,16 +98,72 @@ class InstanceRecord:
 
 @dataclass(frozen=True)
 class PointLabels:
-    """Values of every raw point of one epoch, in input order, (n,) each; names and units as in `dimensions`."""
+    """What was found for every raw point of one epoch, in input order; names and units as in `dimensions`.
 
-    classification: ByteArray
-    height: FloatArray
-    lod95: Float32Array
-    superpoint: UIntArray
-    instance: UIntArray
-    object: UIntArray
-    change: ByteArray
-    confidence: Float32Array
+    Points share what was found for their voxel, and have a height of their own. Nothing is spread over the points
+    before it is asked for: part by part (`of_part`), or one dimension of all points (the properties, (n,) each).
+
+    Attributes
+    ----------
+    survey : Survey
+        The points.
+    voxel_idx : (n,) int32
+        Voxel of each point; -1 for noise.
+    of_voxel : (m + 1,) structured array of `FOUND`
+        Per voxel; the last is for noise. Heights are not filled in.
+    height_of : callable
+        Heights (k,) above ground, m, of local coordinates (k, 3).
+    """
+
+    survey: Survey
+    voxel_idx: IntArray
+    of_voxel: npt.NDArray[Any]
+    height_of: Callable[[FloatArray], FloatArray]
+
+    def __len__(self) -> int:
+        return len(self.voxel_idx)
+
+    def of_part(self, start: int, xyz: FloatArray) -> npt.NDArray[Any]:
+        """Structured array (k,) of `FOUND` for the points from number ``start`` on, at ``xyz`` (k, 3), local m."""
+        found = np.take(self.of_voxel, self.voxel_idx[start : start + len(xyz)])
+        found[HEIGHT.name] = self.height_of(xyz)
+        return found
+
+    @property
+    def height(self) -> FloatArray:
+        """Worked out from all points, each time."""
+        return np.concatenate([np.empty(0), *(self.height_of(xyz) for xyz in self.survey.parts())])
+
+    @property
+    def classification(self) -> ByteArray:
+        return self._spread(CLASSIFICATION)
+
+    @property
+    def lod95(self) -> Float32Array:
+        return self._spread(LOD95)
+
+    @property
+    def superpoint(self) -> UIntArray:
+        return self._spread(SUPERPOINT)
+
+    @property
+    def instance(self) -> UIntArray:
+        return self._spread(INSTANCE)
+
+    @property
+    def object(self) -> UIntArray:
+        return self._spread(OBJECT)
+
+    @property
+    def change(self) -> ByteArray:
+        return self._spread(CHANGE)
+
+    @property
+    def confidence(self) -> Float32Array:
+        return self._spread(CONFIDENCE)
+
+    def _spread(self, dimension: Dimension) -> npt.NDArray[Any]:
+        return np.ascontiguousarray(self.of_voxel[dimension.name])[self.voxel_idx]
 
 
 @dataclass(frozen=True)

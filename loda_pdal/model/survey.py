@@ -1,12 +1,30 @@
-"""One survey as it was read: local coordinates for the method, everything else kept for the output."""
+"""One survey as it was read: points handed out part by part, in local coordinates."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
 
 from loda_pdal.model.cloud import FloatArray
+from loda_pdal.model.extent import Extent
 from loda_pdal.model.frame import LocalFrame
+
+PART = 400_000
+"""Points of one part: what is held of a survey at a time, and a multiple of the chunks of LAZ files."""
+
+
+class PointSource(Protocol):
+    """Points that are elsewhere, in a file, and can be gone through again and again."""
+
+    def __len__(self) -> int: ...
+
+    def coordinates(self) -> Iterator[FloatArray]:
+        """Full map coordinates (k, 3), part by part, in the same order every time."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -15,23 +33,56 @@ class Survey:
 
     Attributes
     ----------
-    xyz : (n, 3) float64, m
-        Local coordinates in ``frame``, on the local grid, in file order.
+    points : (n, 3) float64, m, or PointSource
+        Local coordinates in ``frame``, on the local grid; or the file that holds them.
     frame : LocalFrame
         Shared by both epochs of a run.
     path : str
         Where it came from; empty for arrays.
-    source : Any
-        The reader's own record (laspy), from which the output keeps every dimension; None for arrays.
     notes : list of str
         What the reader wants told: units converted, CRS assumed, points dropped from nothing.
+    dates : (str or None, str or None)
+        First and last day of measurement (ISO, UTC), where the points are dated.
+    n_bytes, sha256 : int or None, str or None
+        Size and checksum of the file as it was read.
+    known_extent : Extent or None
+        What the reader found in passing; worked out when first asked for if left out.
     """
 
-    xyz: FloatArray
+    points: FloatArray | PointSource
     frame: LocalFrame = field(default_factory=lambda: LocalFrame((0, 0, 0)))
     path: str = ""
-    source: Any = None
     notes: list[str] = field(default_factory=list)
+    dates: tuple[str | None, str | None] = (None, None)
+    n_bytes: int | None = None
+    sha256: str | None = None
+    known_extent: Extent | None = None
 
     def __len__(self) -> int:
-        return len(self.xyz)
+        return len(self.points)
+
+    @property
+    def source(self) -> PointSource | None:
+        """The file that holds the points; None where they are in memory."""
+        return None if isinstance(self.points, np.ndarray) else self.points
+
+    @property
+    def xyz(self) -> FloatArray:
+        """Local coordinates (n, 3) of all points, m, in their order; read anew where they are in a file."""
+        if isinstance(self.points, np.ndarray):
+            return self.points
+        return np.concatenate([np.empty((0, 3)), *self.parts()])
+
+    @cached_property
+    def extent(self) -> Extent:
+        """Where the points are."""
+        return Extent.of(self.parts()) if self.known_extent is None else self.known_extent
+
+    def parts(self) -> Iterator[FloatArray]:
+        """Local coordinates (k, 3), m, part by part in the order of the points; none is longer than `PART`."""
+        if isinstance(self.points, np.ndarray):
+            for start in range(0, len(self.points), PART):
+                yield self.points[start : start + PART]
+        else:
+            for xyz in self.points.coordinates():
+                yield self.frame.to_local(xyz)

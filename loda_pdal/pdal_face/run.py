@@ -23,7 +23,7 @@ from pyproj.exceptions import CRSError
 
 import loda_pdal
 from loda_pdal import pipeline
-from loda_pdal.assembly import spread
+from loda_pdal.assembly import height_of_points, spread
 from loda_pdal.io.crs import DeclaredCrs, MapCrs, common_crs
 from loda_pdal.io.las import check_coverage, common_frame
 from loda_pdal.io.outputs import write_outputs
@@ -34,7 +34,7 @@ from loda_pdal.model.dimensions import Dimension
 from loda_pdal.model.errors import InputError, ParameterError, PipelineError
 from loda_pdal.model.frame import LocalFrame
 from loda_pdal.model.labels import ObjectClass
-from loda_pdal.model.pair import Pair
+from loda_pdal.model.pair import Pair, at_once
 from loda_pdal.model.records import ChangeResult
 from loda_pdal.model.survey import Survey
 from loda_pdal.model.transform import transform_points
@@ -128,12 +128,12 @@ class Run:
     @cached_property
     def frame(self) -> LocalFrame:
         """The local frame that both epochs share."""
-        return common_frame(self._map_xyz, _map_crs(self._call, self.arguments))
+        return common_frame(self._map_xyz.map(lambda xyz: xyz.min(axis=0)), _map_crs(self._call, self.arguments))
 
     @cached_property
-    def points(self) -> Pair[FloatArray]:
-        """Raw points of both epochs, local metres."""
-        return self._map_xyz.map(self.frame.to_local)
+    def surveys(self) -> Pair[Survey]:
+        """Raw points of both epochs."""
+        return self._map_xyz.map(lambda xyz: Survey(self.frame.to_local(xyz), self.frame))
 
     @cached_property
     def parameters(self) -> Parameters:
@@ -190,7 +190,7 @@ class Run:
 
     def move_before(self) -> None:
         """Move the before-points onto the after epoch: X, Y and Z change."""
-        moved = self.frame.to_map(transform_points(self["register"].T_after_before, self.points.before))
+        moved = self.frame.to_map(transform_points(self["register"].T_after_before, self.surveys.before.xyz))
         for column, axis in enumerate("XYZ"):
             values = self._call.points.column(axis)
             values[self._is_before] = moved[:, column]
@@ -199,7 +199,7 @@ class Run:
     def assembled(self) -> ChangeResult:
         """The whole result; its GeoPackage, raster and report are written to the run folder."""
         result = pipeline.assemble(
-            self.points,
+            self.surveys,
             self.clouds,
             self["register"],
             self["ground"],
@@ -211,14 +211,13 @@ class Run:
             self.parameters,
         )
         if self._folder is not None:
-            surveys = self.points.map(lambda xyz: Survey(xyz, self.frame))
-            write_outputs(result, surveys, self._folder.path, overwrite=True, with_cloud=False)
+            write_outputs(result, self.surveys, self._folder.path, overwrite=True, with_cloud=False)
         return result
 
 
 STEPS: dict[str, Callable[[Run], Any]] = {
     "parameters": lambda run: _resolved(run),
-    "fuse": lambda run: pipeline.fuse_epochs(run.points, run.parameters),
+    "fuse": lambda run: pipeline.fuse_epochs(run.surveys, run.parameters),
     "register": lambda run: pipeline.register_epochs(run["fuse"], run.parameters),
     "ground": lambda run: pipeline.model_ground(run.clouds, run.parameters),
     "lod": lambda run: pipeline.limit_of_detection(run.clouds, run["register"], run.parameters),
@@ -245,19 +244,16 @@ STEPS: dict[str, Callable[[Run], Any]] = {
 
 def _resolved(run: Run) -> Parameters:
     """Parameters for these points, once they were found to be two surveys of one place."""
-    check_coverage(_NAMES, run.points)
-    return pipeline.resolve(run.arguments.parameters, run.points)
+    check_coverage(_NAMES, run.surveys.map(lambda survey: survey.extent))
+    return pipeline.resolve(run.arguments.parameters, run.surveys)
 
 
 def heights(run: Run) -> Values:
     """Height of every raw point above the ground model of its epoch."""
     registration = run["register"]
-    moved = run.points.join(Pair(registration.T_frame_before, registration.T_frame_after), _moved)
-    return {dims.HEIGHT: moved.join(run["ground"], lambda xyz, g: xyz[:, 2] - g.model.height_at(xyz[:, :2]))}
-
-
-def _moved(xyz: FloatArray, T: FloatArray) -> FloatArray:
-    return transform_points(T, xyz)
+    moves = Pair(registration.T_frame_before, registration.T_frame_after)
+    models = run["ground"].map(lambda ground: ground.model)
+    return {dims.HEIGHT: at_once(height_of_points, moves, models, run.surveys.map(lambda survey: survey.xyz))}
 
 
 def limits(run: Run) -> Values:

@@ -13,7 +13,8 @@ import numpy.typing as npt
 from pyproj import CRS
 
 from loda_pdal.io.crs import declared_crs
-from loda_pdal.io.las import inspect, map_coordinates
+from loda_pdal.io.las import inspect
+from loda_pdal.io.las_points import map_coordinates
 from loda_pdal.model.errors import OutputError, PipelineError
 from loda_pdal.pdal_face.partial import PartialFile
 

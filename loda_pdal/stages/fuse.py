@@ -7,22 +7,28 @@ sums are exact and the result does not depend on the order of the points.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from loda_pdal.kernels.parallel import run_ranges
-from loda_pdal.kernels.voxels import fill_table, number_distinct, voxel_key_range
+from loda_pdal.kernels.voxels import add_points, fill_table, number_distinct, voxel_key_range
 from loda_pdal.model.cloud import FloatArray, Int64Array, IntArray, VoxelCloud
 from loda_pdal.model.errors import InputError
+from loda_pdal.model.survey import PART, Survey
 from loda_pdal.params import FuseParams
 
 
-def fuse_points(xyz: FloatArray, params: FuseParams) -> VoxelCloud:
+def fuse_survey(survey: Survey, params: FuseParams) -> VoxelCloud:
     """One mean point per occupied voxel, sorted by voxel (x first, then y, then z).
+
+    The points pass by in parts; what is kept of each is the number of its voxel.
 
     Parameters
     ----------
-    xyz : (n, 3) float64, m
+    survey : Survey
         Raw points in local coordinates.
     params : FuseParams
         Edge of the voxels; voxel edges lie on its multiples.
@@ -32,9 +38,26 @@ def fuse_points(xyz: FloatArray, params: FuseParams) -> VoxelCloud:
     VoxelCloud
         Means, raw points per voxel, and the voxel of every raw point.
     """
-    voxel_idx, n_voxels = voxel_of_point(xyz, params.leaf_m)
-    n_raw = np.bincount(voxel_idx, minlength=n_voxels).astype(np.int32)
-    return VoxelCloud(mean_of_voxels(xyz, voxel_idx, n_voxels), n_raw, voxel_idx)
+    voxel_idx = np.empty(len(survey), dtype=np.int32)
+    if len(survey) == 0:
+        return VoxelCloud(np.zeros((0, 3)), np.zeros(0, dtype=np.int32), voxel_idx)
+    grid = _VoxelGrid.over(survey.extent.low, survey.extent.high, params.leaf_m)
+    numbers, total, count = _Numbers(), np.zeros((0, 3)), np.zeros(0, dtype=np.int32)
+    start = 0
+    for xyz in survey.parts():
+        number = voxel_idx[start : start + len(xyz)]
+        numbers.of(grid.keys(xyz), number)
+        total, count = enlarged(total, numbers.capacity), enlarged(count, numbers.capacity)
+        add_points(number, np.ascontiguousarray(xyz), total, count)
+        start += len(xyz)
+    order = np.argsort(numbers.keys)
+    _renumber(voxel_idx, order)
+    return VoxelCloud(total[order] / count[order, None], count[order], voxel_idx)
+
+
+def fuse_points(xyz: FloatArray, params: FuseParams) -> VoxelCloud:
+    """`fuse_survey` of points (n, 3), local m."""
+    return fuse_survey(Survey(xyz), params)
 
 
 def downsample(xyz: FloatArray, leaf_m: float) -> FloatArray:
@@ -53,40 +76,93 @@ def mean_of_voxels(xyz: FloatArray, voxel_idx: IntArray, n_voxels: int) -> Float
 
 def voxel_of_point(xyz: FloatArray, leaf_m: float) -> tuple[IntArray, int]:
     """Voxel of each point (n,), numbered in the order of the occupied voxels, and how many are occupied."""
+    voxel_idx = np.empty(len(xyz), dtype=np.int32)
     if len(xyz) == 0:
-        return np.zeros(0, dtype=np.int32), 0
-    number, distinct = _numbered(_voxel_keys(xyz, leaf_m))
-    rank = np.empty(len(distinct), dtype=np.int32)
-    rank[np.argsort(distinct)] = np.arange(len(distinct), dtype=np.int32)
-    return rank[number], len(distinct)
+        return voxel_idx, 0
+    low, high = (np.array([function(xyz[:, axis]) for axis in range(3)]) for function in (np.min, np.max))
+    numbers = _Numbers()
+    numbers.of(_VoxelGrid.over(low, high, leaf_m).keys(xyz), voxel_idx)
+    _renumber(voxel_idx, np.argsort(numbers.keys))
+    return voxel_idx, len(numbers.keys)
 
 
-def _numbered(key: Int64Array) -> tuple[IntArray, Int64Array]:
-    """Number of each key (n,) in the order of appearance, and the distinct keys in that order."""
-    number = np.empty(len(key), dtype=np.int32)
-    size = 1 << 16
-    distinct = np.empty(0, dtype=np.int64)
-    reached = n_distinct = 0
-    while reached < len(key):
-        size *= 4
-        table = np.full(size, -1, dtype=np.int32)
-        distinct = np.append(distinct, np.empty(size // 2 - len(distinct), dtype=np.int64))
-        fill_table(table, distinct, n_distinct)
-        reached, n_distinct = number_distinct(key, reached, table, distinct, n_distinct, number)
-    return number, distinct[:n_distinct]
+@dataclass(frozen=True)
+class _VoxelGrid:
+    """Voxels of a box: the lowest (3,) int64, and how many there are along y and z."""
+
+    leaf_m: float
+    low: Int64Array
+    n_y: int
+    n_z: int
+
+    @classmethod
+    def over(cls, low: FloatArray, high: FloatArray, leaf_m: float) -> _VoxelGrid:
+        """The voxels from coordinates ``low`` to ``high`` (3,), m."""
+        first, last = (np.floor(corner / leaf_m).astype(np.int64) for corner in (low, high))
+        n_x, n_y, n_z = (int(n) for n in last - first + 1)
+        if math.log2(n_x) + math.log2(n_y) + math.log2(n_z) > 62:
+            extent = " x ".join(f"{n * leaf_m:.3g}" for n in (n_x, n_y, n_z))
+            raise InputError(
+                f"The survey spans {extent} m, too far for voxels of {leaf_m} m.",
+                "Remove stray points far from the rest, or raise fuse.leaf_m.",
+                "extent-absurd",
+            )
+        return cls(float(leaf_m), first, n_y, n_z)
+
+    def keys(self, xyz: FloatArray) -> Int64Array:
+        """Key (n,) of the voxel of each point; keys sort by x first, then y, then z."""
+        key = np.empty(len(xyz), dtype=np.int64)
+        xyz = np.ascontiguousarray(xyz)
+        run_ranges(voxel_key_range, len(xyz), xyz, self.leaf_m, self.low, self.n_y, self.n_z, key)
+        return key
 
 
-def _voxel_keys(xyz: FloatArray, leaf_m: float) -> Int64Array:
-    low = np.array([np.floor(xyz[:, axis].min() / leaf_m) for axis in range(3)], dtype=np.int64)
-    high = np.array([np.floor(xyz[:, axis].max() / leaf_m) for axis in range(3)], dtype=np.int64)
-    n_x, n_y, n_z = (int(n) for n in high - low + 1)
-    if math.log2(n_x) + math.log2(n_y) + math.log2(n_z) > 62:
-        extent = " x ".join(f"{n * leaf_m:.3g}" for n in (n_x, n_y, n_z))
-        raise InputError(
-            f"The survey spans {extent} m, too far for voxels of {leaf_m} m.",
-            "Remove stray points far from the rest, or raise fuse.leaf_m.",
-            "extent-absurd",
-        )
-    key = np.empty(len(xyz), dtype=np.int64)
-    run_ranges(voxel_key_range, len(xyz), np.ascontiguousarray(xyz), float(leaf_m), low, n_y, n_z, key)
-    return key
+class _Numbers:
+    """Distinct keys, numbered in the order in which they appear."""
+
+    def __init__(self) -> None:
+        self._n = 0
+        self._distinct = np.empty(0, dtype=np.int64)
+        self._table = np.empty(0, dtype=np.int32)
+        self._grow()
+
+    @property
+    def keys(self) -> Int64Array:
+        """The keys so far, by number."""
+        return self._distinct[: self._n]
+
+    @property
+    def capacity(self) -> int:
+        """Numbers stay below this until the table grows."""
+        return len(self._distinct)
+
+    def of(self, key: Int64Array, number: IntArray) -> None:
+        """Write the number of each key (n,) into ``number`` (n,)."""
+        reached = 0
+        while reached < len(key):
+            reached, self._n = number_distinct(key, reached, self._table, self._distinct, self._n, number)
+            if reached < len(key):
+                self._grow()
+
+    def _grow(self) -> None:
+        size = max(4 * len(self._table), 1 << 18)
+        self._table = np.full(size, -1, dtype=np.int32)
+        self._distinct = enlarged(self._distinct, size // 2)
+        fill_table(self._table, self._distinct, self._n)
+
+
+def enlarged(values: npt.NDArray[Any], n: int) -> npt.NDArray[Any]:
+    """An array of ``n`` rows that begins with ``values`` and goes on with zeros; ``values`` itself if long enough."""
+    if len(values) >= n:
+        return values
+    longer = np.zeros((n, *values.shape[1:]), dtype=values.dtype)
+    longer[: len(values)] = values
+    return longer
+
+
+def _renumber(number: IntArray, order: npt.NDArray[np.intp]) -> None:
+    """Replace each number (n,) by its rank, given the numbers in their new order; part by part, in place."""
+    rank = np.empty(len(order), dtype=np.int32)
+    rank[order] = np.arange(len(order), dtype=np.int32)
+    for start in range(0, len(number), PART):
+        number[start : start + PART] = rank[number[start : start + PART]]
