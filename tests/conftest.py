@@ -34,6 +34,16 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 @pytest.fixture(scope="session")
+def compiled_kernels() -> None:
+    """For tests of what a run says or how long it takes: with a cold cache it would compile first."""
+    from loda_pdal.kernels import is_cache_warm
+    from loda_pdal.warmup import compile_kernels
+
+    if not is_cache_warm():
+        compile_kernels()
+
+
+@pytest.fixture(scope="session")
 def data_dir() -> Path:
     """Folder of the real point clouds; for tests marked `data`."""
     folder = _data_folder()

@@ -167,11 +167,3 @@ def test_kernels_are_cached_where_the_user_may_write(monkeypatch: pytest.MonkeyP
     if os.name != "nt":
         folder.chmod(0o777)  # others could plant code there
         assert loda_pdal.kernels._writable_folder() != folder
-
-
-def test_the_cache_is_warm_once_something_is_compiled(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    assert not loda_pdal.kernels.is_cache_warm()
-    (tmp_path / "kernels").mkdir()
-    (tmp_path / "kernels" / "a.nbi").write_bytes(b"")
-    assert loda_pdal.kernels.is_cache_warm()

@@ -33,7 +33,7 @@ def own_threads(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def block(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def block(tmp_path_factory: pytest.TempPathFactory, compiled_kernels: None) -> Path:
     """A short simulated street, surveyed twice."""
     folder = tmp_path_factory.mktemp("block")
     write_block(simulate_block(3, SimulationOptions(length_m=30.0, width_m=40.0, density=0.25, lanes=(0.0,))), folder)

@@ -119,13 +119,11 @@ def _run(
     """The run itself: its summary and the files it wrote."""
     from loda_pdal.io.outputs import abandon_outputs, write_outputs
     from loda_pdal.io.summary import summarise
-    from loda_pdal.kernels import is_cache_warm
     from loda_pdal.pipeline import STEPS, detect_changes
 
     stopping.before_stopping(abandon_outputs)
     options.use_threads(threads)
-    if not is_cache_warm():
-        reporter.info("The first run compiles its kernels, once; that takes about a minute.")
+    options.compile_kernels(reporter)
     started, total = datetime.now(tz=UTC), len(STEPS) + 1
 
     def progress(done: int, of: int, text: str) -> None:

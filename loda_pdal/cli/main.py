@@ -23,6 +23,7 @@ COMMANDS = {
     "info": "loda_pdal.cli.info:info",
     "params": "loda_pdal.cli.params:params",
     "report": "loda_pdal.cli.report:report",
+    "warmup": "loda_pdal.cli.warmup:warmup",
     "bench": "loda_pdal.benchmark.commands:bench",
 }
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from loda_pdal.cli.progress import KINDS
+from loda_pdal.cli.progress import KINDS, Reporter
 from loda_pdal.params import PRESETS, Parameters
+
+if TYPE_CHECKING:
+    from loda_pdal.warmup import Compiled
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -55,6 +58,18 @@ def use_threads(n: int | None) -> None:
     """Let kernels run in ``n`` threads, here and in programs that we start; None leaves the choice to them."""
     if n is not None:
         os.environ["LODA_THREADS"] = str(n)
+
+
+def compile_kernels(reporter: Reporter) -> Compiled | None:
+    """Compile the kernels and say so; None, at once, where that has been done."""
+    from loda_pdal.kernels import is_cache_warm
+
+    if is_cache_warm():
+        return None
+    from loda_pdal import warmup
+
+    reporter.info("Compiling kernels, once: that takes about half a minute.")
+    return warmup.compile_kernels(reporter.progress)
 
 
 as_json = click.option("--json", "as_json", is_flag=True, help="Write the result as JSON to stdout.")

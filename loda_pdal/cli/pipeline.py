@@ -46,10 +46,14 @@ def pipeline(
     with reporter_for(progress_kind) as reporter:
         if progress_kind == "json":
             stopping.when_parent_dies()
+        from loda_pdal.kernels import is_cache_warm
         from loda_pdal.pdal_face import run_pipeline, stop_pdal
 
         stopping.before_stopping(stop_pdal)
         options.use_threads(threads)
+        if not validate and not is_cache_warm():
+            run_pipeline(file, overrides, engine=engine, validate=True)  # what is wrong with it, before a long wait
+            options.compile_kernels(reporter)
         done = run_pipeline(file, overrides, engine=engine, validate=validate, progress=reporter.progress)
         if done.is_validated_only:
             reporter.info("Everything is in order; nothing was computed.")

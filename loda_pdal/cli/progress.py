@@ -80,12 +80,19 @@ class Reporter:
 
 
 class LineReporter(Reporter):
-    """One line per step, for logs."""
+    """One line per step, for logs; within a step one every few seconds."""
+
+    EVERY_S = 5.0
 
     def __init__(self) -> None:
         self._start = time.perf_counter()
+        self._text, self._last = "", 0.0
 
     def progress(self, done: int, total: int, text: str) -> None:
+        now = time.perf_counter()
+        if text == self._text and now - self._last < self.EVERY_S:
+            return
+        self._text, self._last = text, now
         self._line(f"[{done:>{len(str(total))}}/{total}] {time.perf_counter() - self._start:6.1f} s  {text}")
 
 

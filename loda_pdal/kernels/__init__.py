@@ -2,15 +2,17 @@
 
 Compiled kernels are cached in the user's cache folder, so that every process finds them again
 (``NUMBA_CACHE_DIR`` is respected where the user set it). A folder that cannot be written is replaced by one of the
-user's own under the temporary folder.
+user's own under the temporary folder. `loda_pdal.warmup` compiles everything that is not there yet.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
 import stat
 import sys
 import tempfile
+from importlib.metadata import version
 from pathlib import Path
 
 
@@ -21,8 +23,29 @@ def cache_folder() -> Path:
 
 
 def is_cache_warm() -> bool:
-    """Whether compiled kernels are there already; if not, the first run compiles them, which takes a minute."""
-    return any(cache_folder().rglob("*.nbi"))
+    """Whether every kernel of this version is compiled, for this Python, numba and processor (`mark_cache_warm`)."""
+    return _marker().is_file()
+
+
+def mark_cache_warm() -> None:
+    """Remember that nothing is left to compile; forgotten as soon as a kernel, Python, numba or processor changes."""
+    marker = _marker()
+    try:
+        marker.parent.mkdir(parents=True, exist_ok=True)
+        marker.write_text("Everything that loda-pdal compiles is here.\n", encoding="utf-8")
+    except OSError:  # then it is not remembered: the next run looks through the kernels again
+        return
+
+
+def _marker() -> Path:
+    """A file whose name is what compiled kernels depend on."""
+    from llvmlite import binding
+
+    here = Path(__file__).parent
+    sources = [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in sorted(here.glob("*.py"))]
+    machine = (binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten())
+    key = repr((sources, sys.version, version("numba"), version("llvmlite"), machine))
+    return cache_folder() / f"loda-pdal-{hashlib.sha256(key.encode()).hexdigest()[:16]}.warm"
 
 
 def _loaded_numba_config() -> object:

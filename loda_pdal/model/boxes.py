@@ -131,8 +131,9 @@ def box_iou(a: Boxes, i: npt.NDArray[Any], b: Boxes, j: npt.NDArray[Any]) -> Flo
     (p,) float64
         0 to 1, exact up to rounding, and the same number when the sets change places; 0 where a box is NaN.
     """
-    first, second = np.asarray(i, dtype=np.int64), np.asarray(j, dtype=np.int64)
+    first, second = np.ascontiguousarray(i, dtype=np.int64), np.ascontiguousarray(j, dtype=np.int64)
+    boxes = [np.ascontiguousarray(each) for each in (a.centre, a.axes, a.size, b.centre, b.axes, b.size)]
     shared = np.zeros(len(first))
-    run_ranges(shared_volumes, len(first), first, second, a.centre, a.axes, a.size, b.centre, b.axes, b.size, shared)
+    run_ranges(shared_volumes, len(first), first, second, *boxes, shared)
     union = a.volume[first] + b.volume[second] - shared
     return np.clip(np.divide(shared, union, out=np.zeros(len(first)), where=union > 0), 0.0, 1.0)

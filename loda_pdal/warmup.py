@@ -1,0 +1,121 @@
+"""Compiling every kernel once, before the first survey is waited for.
+
+The method is run on a scene of a few thousand points that sends something through every kernel, with every preset; what
+gets compiled on the way is kept in the cache folder of `loda_pdal.kernels`, for all processes to come.
+"""
+
+from __future__ import annotations
+
+import logging
+import pkgutil
+import time
+from importlib import import_module
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba.core import event
+from numba.core.dispatcher import Dispatcher
+
+import loda_pdal.kernels
+from loda_pdal.kernels import mark_cache_warm
+from loda_pdal.model.cloud import FloatArray, to_local_grid
+from loda_pdal.model.pair import Pair
+from loda_pdal.model.survey import Survey
+from loda_pdal.params import PRESETS, Parameters
+from loda_pdal.pipeline import Progress, detect_changes
+
+logger = logging.getLogger(__name__)
+
+COMPILING = "compiling kernels, once"
+"""What progress says meanwhile."""
+
+SIMULATION = frozenset({"loda_pdal.kernels.rays"})
+"""Kernels that only the simulator of benchmarks runs; it compiles them itself."""
+
+
+class Compiled(NamedTuple):
+    """How many kernels were compiled (for all types together) and in how many seconds."""
+
+    n: int
+    seconds: float
+
+
+def compile_kernels(progress: Progress | None = None) -> Compiled:
+    """Compile what is not in the cache folder yet, and mark the folder as complete (`is_cache_warm`).
+
+    Parameters
+    ----------
+    progress : callable, optional
+        ``progress(done, total, text)``, called whenever a kernel has been compiled.
+    """
+    start, surveys = time.perf_counter(), small_scene()
+    with event.install_listener("numba:compile", _Count(progress)) as count:
+        for preset in PRESETS:
+            detect_changes(surveys.before, surveys.after, Parameters.preset(preset))
+    mark_cache_warm()
+    return Compiled(len(count.compiled), time.perf_counter() - start)
+
+
+def kernels() -> list[Any]:
+    """Every compiled function of the method (numba's ``Dispatcher``), by module and name."""
+    found = []
+    for module in pkgutil.iter_modules(loda_pdal.kernels.__path__, "loda_pdal.kernels."):
+        if module.name not in SIMULATION:
+            values = vars(import_module(module.name)).values()
+            found += [v for v in values if isinstance(v, Dispatcher) and v.py_func.__module__ == module.name]
+    return sorted(found, key=_name)
+
+
+def _name(kernel: Any) -> str:
+    return f"{kernel.py_func.__module__}.{kernel.py_func.__qualname__}"
+
+
+class _Count(event.Listener):  # type: ignore[misc]
+    """Counts our kernels as they get compiled, and logs what each took; numba compiles one at a time."""
+
+    def __init__(self, progress: Progress | None) -> None:
+        self.compiled: set[str] = set()
+        self._ours = {_name(kernel) for kernel in kernels()}
+        self._progress = progress or (lambda done, total, text: None)
+        self._seconds: list[float] = []
+
+    def on_start(self, event: Any) -> None:
+        """A kernel is to be compiled, maybe amid one that calls it."""
+        self._seconds.append(-time.thread_time())
+
+    def on_end(self, event: Any) -> None:
+        """It is."""
+        seconds = self._seconds.pop() + time.thread_time()
+        if self._seconds:  # the caller's own time is what remains
+            self._seconds[-1] -= seconds
+        kernel = event.data["dispatcher"]
+        logger.debug("%5.2f s  %s(%s)", seconds, _name(kernel), ", ".join(map(str, event.data["args"])))
+        if _name(kernel) in self._ours - self.compiled:
+            self.compiled.add(_name(kernel))
+            self._progress(len(self.compiled), len(self._ours), COMPILING)
+
+
+def small_scene() -> Pair[Survey]:
+    """Two surveys of 24 x 24 m with a house that gets a storey, a tree, and a car that leaves; the same every time."""
+    random = np.random.default_rng(0)
+    ground = _box(random, (0, 0, 0), (24, 24, 0), 16000)
+    house, storey = _box(random, (2, 3, 0), (10, 9, 4), 9000), _box(random, (2, 3, 4), (6, 9, 7), 4000)
+    tree = random.normal((18, 18, 4), 0.8, (2500, 3))
+    pole = _box(random, (14, 6, 0), (14.1, 6.1, 4), 300)
+    car = _box(random, (15, 12, 0.3), (19, 13.8, 1.6), 1500)
+
+    def survey(*parts: FloatArray) -> Survey:
+        xyz = np.concatenate(parts)
+        return Survey(to_local_grid(xyz + random.normal(0, 0.01, xyz.shape)))
+
+    return Pair(survey(ground, house, tree, pole, car), survey(ground, house, storey, tree, pole))
+
+
+def _box(random: np.random.Generator, low: tuple[float, ...], high: tuple[float, ...], n: int) -> FloatArray:
+    """About ``n`` points (m, 3) on the faces of a box that can be seen: all but the lower one."""
+    at = random.random((n, 3))
+    size = np.subtract(high, low)
+    areas = np.array([size[1] * size[2], size[0] * size[2], size[0] * size[1] / 2])
+    face = random.choice(3, n, p=areas / areas.sum())
+    at[np.arange(n), face] = np.where(face == 2, 1.0, np.round(at[np.arange(n), face]))
+    return np.asarray(low + at * size)
