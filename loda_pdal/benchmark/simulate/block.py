@@ -15,7 +15,7 @@ from loda_pdal.benchmark.simulate.raycast import RayCaster
 from loda_pdal.benchmark.simulate.scene import Ground, draw_street
 from loda_pdal.benchmark.simulate.sensor import Drive, Scan, Scanner, Sensor, drive, rigid_move, scan, sees
 from loda_pdal.benchmark.simulate.shapes import EMPTY, Shape, distance_to_triangles, joined
-from loda_pdal.benchmark.simulate.town import draw_town, draw_town_edits
+from loda_pdal.benchmark.simulate.town import ModelHouse, draw_town, draw_town_edits
 from loda_pdal.benchmark.truth import Truth, TruthInstance
 from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, Int64Array
 from loda_pdal.model.errors import ParameterError
@@ -246,9 +246,10 @@ def _changes_of_returns(scenes: Pair[EpochScene], scans: Pair[Scan], items: list
     """`ChangeLabel` of the surface under each return, (n,) per survey.
 
     A primitive that only one survey has may lie in a surface that both have (a wall under a new storey): of buildings
-    that grew or shrank, returns from such places are unchanged.
+    of a city model that grew or shrank, returns from such places are unchanged. (Houses of a street are built so that
+    they share such primitives.)
     """
-    grown = [i for i in items if i.object_class is ObjectClass.BUILDING and i.before and i.after and i.edit]
+    grown = [i for i in items if i.before and i.after and i.edit and isinstance(i.placed.thing, ModelHouse)]
     changes = scenes.join(scans, lambda scene, measured: scene.change[measured.primitive])
     for item in grown:
         surface = scenes.map(lambda scene, owner=item.instance_id: _surface_of(scene, owner))  # type: ignore[misc]
