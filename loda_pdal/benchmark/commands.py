@@ -16,8 +16,12 @@ def bench() -> None:
 @bench.command()
 @click.argument("out", type=click.Path(path_type=Path, file_okay=False))
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Street, edits, noise and place.")
-@click.option("--length", type=float, default=100.0, show_default=True, help="Length of the street, m.")
+@click.option("--city", type=click.Path(path_type=Path), help="CityJSON model to take the buildings from.")
+@click.option("--sensor", type=click.Choice(["vehicle", "airborne"]), default="vehicle", show_default=True)
+@click.option("--length", type=float, default=100.0, show_default=True, help="Length of the block, m.")
+@click.option("--width", type=float, default=56.0, show_default=True, help="Width of the block, m.")
 @click.option("--density", type=float, default=1.0, show_default=True, help="Pulses, relative to the default.")
+@click.option("--density-after", type=float, default=1.0, show_default=True, help="Pulses of the later survey.")
 @click.option("--lanes", type=click.IntRange(1, 2), default=2, show_default=True, help="Passes of the vehicle.")
 @click.option("--shift", type=float, default=0.05, show_default=True, help="Misregistration of the before epoch, m.")
 @click.option("--rotation", type=float, default=0.2, show_default=True, help="Its rotation, degrees.")
@@ -31,8 +35,12 @@ def bench() -> None:
 def simulate(
     out: Path,
     seed: int,
+    city: Path | None,
+    sensor: str,
     length: float,
+    width: float,
     density: float,
+    density_after: float,
     lanes: int,
     shift: float,
     rotation: float,
@@ -42,12 +50,16 @@ def simulate(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Make a street block, survey it twice, and write before.laz, after.laz and truth.json to OUT."""
+    """Make a block of a street or city, survey it twice, and write before.laz, after.laz and truth.json to OUT."""
     from loda_pdal.benchmark.simulate import SimulationOptions, fused_block, simulate_block, write_block
 
     options = SimulationOptions(
         length_m=length,
+        width_m=width,
+        city="" if city is None else str(city),
+        sensor=sensor,
         density=density,
+        density_after=density_after,
         lanes=(-1.6, 1.6)[:lanes],
         shift_m=shift,
         rotation_deg=rotation,

@@ -1,4 +1,4 @@
-"""One street block, surveyed twice, with everything known about it."""
+"""One block of a street or town, surveyed twice, with everything known about it."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from loda_pdal.benchmark.simulate.edits import EditCounts, GroundItem, Item, draw_edits
+from loda_pdal.benchmark.simulate.airborne import AirborneSensor, fly
+from loda_pdal.benchmark.simulate.city_model import read_city_model
+from loda_pdal.benchmark.simulate.edits import UNCHANGED, EditCounts, GroundItem, Item, draw_edits
 from loda_pdal.benchmark.simulate.raycast import RayCaster
-from loda_pdal.benchmark.simulate.scene import Terrain, draw_street
-from loda_pdal.benchmark.simulate.sensor import Drive, Scan, Sensor, drive, rigid_move, scan, sees
-from loda_pdal.benchmark.simulate.shapes import EMPTY, Shape, joined
+from loda_pdal.benchmark.simulate.scene import Ground, draw_street
+from loda_pdal.benchmark.simulate.sensor import Drive, Scan, Scanner, Sensor, drive, rigid_move, scan, sees
+from loda_pdal.benchmark.simulate.shapes import EMPTY, Shape, distance_to_triangles, joined
+from loda_pdal.benchmark.simulate.town import ModelHouse, draw_town, draw_town_edits
 from loda_pdal.benchmark.truth import Truth, TruthInstance
 from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, Int64Array
 from loda_pdal.model.errors import ParameterError
@@ -46,8 +49,14 @@ class SimulationOptions:
     ----------
     length_m, width_m : float
         Extent along and across the street.
+    city : str
+        CityJSON file that the buildings come from; empty for a procedural street.
+    sensor : str
+        ``vehicle`` or ``airborne``.
     density : float
-        Pulses per survey; 1 gives about 0.65 million returns from 100 m of street.
+        Pulses per survey; 1 gives about 0.65 million returns from 100 m of street, or 10 pulses per m2 from the air.
+    density_after : float
+        Pulses of the later survey, relative to the earlier one.
     lanes : tuple of float
         One pass of the vehicle per entry: where it drives, m from the middle of the street.
     shift_m, rotation_deg : float
@@ -64,7 +73,10 @@ class SimulationOptions:
 
     length_m: float = 100.0
     width_m: float = 56.0
+    city: str = ""
+    sensor: str = "vehicle"
     density: float = 1.0
+    density_after: float = 1.0
     lanes: tuple[float, ...] = (-1.6, 1.6)
     shift_m: float = 0.05
     rotation_deg: float = 0.2
@@ -77,8 +89,9 @@ class SimulationOptions:
     def __post_init__(self) -> None:
         for name, low, high in (
             ("length_m", 30.0, 2000.0),
-            ("width_m", 10.0, 80.0),
+            ("width_m", 10.0, 80.0 if not self.city else 400.0),
             ("density", 0.01, 20.0),
+            ("density_after", 0.1, 10.0),
             ("shift_m", 0.0, 100.0),
             ("rotation_deg", 0.0, 180.0),
             ("noise_m", 0.0, 1.0),
@@ -90,6 +103,8 @@ class SimulationOptions:
                     "Choose a value in that range.",
                     "parameter-range",
                 )
+        if self.sensor not in ("vehicle", "airborne"):
+            raise ParameterError(f"No sensor {self.sensor!r}.", "Choose vehicle or airborne.", "parameter-range")
         if not self.lanes:
             raise ParameterError("No lane to drive on.", "Give at least one.", "parameter-range")
 
@@ -157,26 +172,33 @@ def simulate_block(seed: int, options: SimulationOptions | None = None) -> Simul
     SimulatedBlock
     """
     options = options or SimulationOptions()
-    street = draw_street(_stream(seed, _STREET), options.length_m)
-    counts = EditCounts() if options.has_edits else None
-    items, grounds = draw_edits(street, _stream(seed, _EDITS), counts)
-    scenes = epoch_scenes(street.terrain, items, grounds, seed)
-
-    sensor = Sensor(noise_m=options.noise_m, drift_m=options.drift_m, drift_deg=1.5 * options.drift_m)
-    sensor = replace(sensor, column_share=min(sensor.column_share * options.density, 1.0))
+    terrain, items, grounds = _contents(seed, options)
+    scenes = epoch_scenes(terrain, items, grounds, seed)
     randoms = _SURVEY.map(lambda code: _stream(seed, code))
-    drives = randoms.map(lambda random: drive(sensor, street.terrain, options.lanes, 12.0, random))
+    surveyed = randoms.join(
+        Pair(options.density, options.density * options.density_after),
+        lambda random, density: _survey_plan(options, density, terrain, random),
+    )
+    sensors, drives = surveyed.map(lambda plan: plan[0]), surveyed.map(lambda plan: plan[1])
     scans = Pair(
-        scan(sensor, scenes.before.surface, drives.before, randoms.before),
-        scan(sensor, scenes.after.surface, drives.after, randoms.after),
+        scan(sensors.before, scenes.before.surface, drives.before, randoms.before),
+        scan(sensors.after, scenes.after.surface, drives.after, randoms.after),
     ).map(lambda measured: _cropped(measured, options))
+    changes = _changes_of_returns(scenes, scans, items)
 
     T_map_street = _placement(_stream(seed, _PLACE), options)
     T_before_after = _misregistration(_stream(seed, _MOVE), options, T_map_street)
-    instances = _instances(sensor, items, grounds, scenes, scans, drives, T_map_street, options)
+    instances = _instances(sensors, items, grounds, scenes, scans, changes, drives, T_map_street, options)
     surveys = Pair(
-        _survey(scans.before, scenes.before, drives.before, T_before_after @ T_map_street, _START_TIME.before),
-        _survey(scans.after, scenes.after, drives.after, T_map_street, _START_TIME.after),
+        _survey(
+            scans.before,
+            scenes.before,
+            changes.before,
+            drives.before,
+            T_before_after @ T_map_street,
+            _START_TIME.before,
+        ),
+        _survey(scans.after, scenes.after, changes.after, drives.after, T_map_street, _START_TIME.after),
     )
     truth = Truth(
         instances,
@@ -219,7 +241,60 @@ def _stream(seed: int, purpose: int) -> np.random.Generator:
     return np.random.default_rng([seed, purpose])
 
 
-def epoch_scenes(terrain: Terrain, items: list[Item], grounds: list[GroundItem], seed: int) -> Pair[EpochScene]:
+def _contents(seed: int, options: SimulationOptions) -> tuple[Ground, list[Item], list[GroundItem]]:
+    """What the block holds, with what changes: a street, or a piece of a city."""
+    if not options.city:
+        street = draw_street(_stream(seed, _STREET), options.length_m)
+        counts = EditCounts() if options.has_edits else None
+        return street.terrain, *draw_edits(street, _stream(seed, _EDITS), counts)
+    buildings = read_city_model(options.city)
+    needs_street = options.sensor == "vehicle"
+    town = draw_town(buildings, _stream(seed, _STREET), options.length_m, options.width_m, needs_street)
+    return town.terrain, *draw_town_edits(town, _stream(seed, _EDITS), options.has_edits)
+
+
+def _survey_plan(
+    options: SimulationOptions, density: float, terrain: Ground, random: np.random.Generator
+) -> tuple[Scanner, Drive]:
+    """The scanner of one survey and its way."""
+    if options.sensor == "airborne":
+        plane = AirborneSensor(
+            options.length_m, options.width_m, 10.0 * density, noise_m=options.noise_m, strip_shift_m=options.drift_m
+        )
+        return plane, fly(plane, 0.0, random)
+    car = Sensor(noise_m=options.noise_m, drift_m=options.drift_m, drift_deg=1.5 * options.drift_m)
+    car = replace(car, column_share=min(car.column_share * density, 1.0))
+    return car, drive(car, terrain, options.lanes, 12.0, random)
+
+
+def _changes_of_returns(scenes: Pair[EpochScene], scans: Pair[Scan], items: list[Item]) -> Pair[ByteArray]:
+    """`ChangeLabel` of the surface under each return, (n,) per survey.
+
+    A primitive that only one survey has may lie in a surface that both have (a wall under a new storey): of buildings
+    of a city model that grew or shrank, returns from such places are unchanged. (Houses of a street are built so that
+    they share such primitives.)
+    """
+    grown = [i for i in items if i.before and i.after and i.edit and isinstance(i.placed.thing, ModelHouse)]
+    changes = scenes.join(scans, lambda scene, measured: scene.change[measured.primitive])
+    for item in grown:
+        surface = scenes.map(lambda scene, owner=item.instance_id: _surface_of(scene, owner))  # type: ignore[misc]
+        for scene, measured, change, other in zip(scenes, scans, changes, surface.swapped, strict=True):
+            at = np.flatnonzero((scene.owner[measured.primitive] == item.instance_id) & (change != UNCHANGED))
+            change[at[distance_to_triangles(measured.xyz[at], other) < _SAME_SURFACE_M]] = UNCHANGED
+    return changes
+
+
+def _surface_of(scene: EpochScene, instance_id: int) -> FloatArray:
+    """Triangles of one instance."""
+    triangles = scene.surface.triangles
+    return np.asarray(triangles[scene.owner[: len(triangles)] == instance_id])
+
+
+_SAME_SURFACE_M = 0.12
+"""Returns this near to the other survey's surface of the same building show nothing that changed."""
+
+
+def epoch_scenes(terrain: Ground, items: list[Item], grounds: list[GroundItem], seed: int) -> Pair[EpochScene]:
     """Both states of the street, ready to be surveyed; foliage is drawn anew for each."""
     outlines = [g.patch for g in grounds]
     ground_ids = np.array([g.instance_id for g in grounds] + [0])
@@ -296,7 +371,7 @@ def _misregistration(random: np.random.Generator, options: SimulationOptions, T_
 
 
 def _survey(
-    measured: Scan, scene: EpochScene, path: Drive, T_map_street: FloatArray, start_time: float
+    measured: Scan, scene: EpochScene, change: ByteArray, path: Drive, T_map_street: FloatArray, start_time: float
 ) -> SimulatedSurvey:
     station = np.unique(np.round(np.linspace(0, len(path.time) - 1, 400)).astype(int))
     positions = transform_points(T_map_street, path.recorded[station])
@@ -304,7 +379,7 @@ def _survey(
     return SimulatedSurvey(
         np.round(xyz / COORDINATE_STEP_M) * COORDINATE_STEP_M,
         scene.owner[measured.primitive].astype(np.uint32),
-        scene.change[measured.primitive],
+        change,
         start_time + measured.time,
         measured.intensity,
         np.column_stack([start_time + path.time[station], positions]),
@@ -318,11 +393,12 @@ def _outline(T_map_street: FloatArray, options: SimulationOptions) -> list[tuple
 
 
 def _instances(
-    sensor: Sensor,
+    sensors: Pair[Scanner],
     items: list[Item],
     grounds: list[GroundItem],
     scenes: Pair[EpochScene],
     scans: Pair[Scan],
+    changes: Pair[ByteArray],
     drives: Pair[Drive],
     T_map_street: FloatArray,
     options: SimulationOptions,
@@ -330,14 +406,19 @@ def _instances(
     """The truth about every instance, with what the surveys caught of it."""
     casters = scenes.map(lambda scene: RayCaster(scene.surface))
     n_ids = max([i.instance_id for i in items] + [g.instance_id for g in grounds], default=0) + 1
-    caught = scenes.join(scans, lambda scene, measured: _caught(scene, measured, n_ids))
+    caught = Pair(
+        _caught(scenes.before, scans.before, changes.before, n_ids),
+        _caught(scenes.after, scans.after, changes.after, n_ids),
+    )
 
     def instance_of(one: Item | GroundItem, kind: str, object_class: ObjectClass, exists: Pair[bool]) -> TruthInstance:
         points = np.concatenate([c.points[one.instance_id] for c in caught])
         sample = points[np.unique(np.linspace(0, len(points) - 1, 100).astype(int))] if len(points) else points
         replaced_by = (one.partner if isinstance(one, Item) else None) or -1
 
-        def visible_share(stands: bool, caster: RayCaster, path: Drive, scene: EpochScene) -> float | None:
+        def visible_share(
+            stands: bool, sensor: Scanner, caster: RayCaster, path: Drive, scene: EpochScene
+        ) -> float | None:
             return None if stands else _share(sees(sensor, caster, path, sample, scene.owner == replaced_by))
 
         instance = TruthInstance(
@@ -349,8 +430,8 @@ def _instances(
             caught.map(lambda c: len(c.points[one.instance_id])),
             caught.map(lambda c: int(c.n_changed[one.instance_id])),
             Pair(
-                visible_share(exists.before, casters.before, drives.before, scenes.before),
-                visible_share(exists.after, casters.after, drives.after, scenes.after),
+                visible_share(exists.before, sensors.before, casters.before, drives.before, scenes.before),
+                visible_share(exists.after, sensors.after, casters.after, drives.after, scenes.after),
             ),
             one.edit,
             one.note,
@@ -374,8 +455,8 @@ class _Caught(NamedTuple):
     n_changed: Int64Array
 
 
-def _caught(scene: EpochScene, measured: Scan, n_ids: int) -> _Caught:
-    owner, change = scene.owner[measured.primitive], scene.change[measured.primitive]
+def _caught(scene: EpochScene, measured: Scan, change: ByteArray, n_ids: int) -> _Caught:
+    owner = scene.owner[measured.primitive]
     order = np.argsort(owner, kind="stable")
     bounds = np.searchsorted(owner[order], np.arange(1, n_ids))
     n_changed = np.bincount(owner[change != ChangeLabel.UNCHANGED], minlength=n_ids)

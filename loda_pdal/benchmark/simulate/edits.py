@@ -96,10 +96,10 @@ class EditCounts:
     ground: tuple[int, int] = (1, 1)
 
 
-class _Ledger:
-    """The instances as edits are drawn: things leave the stock of the street once they are dealt with."""
+class Ledger:
+    """The instances as edits are drawn: things leave the stock of the street (or town) once they are dealt with."""
 
-    def __init__(self, street: Street, random: np.random.Generator) -> None:
+    def __init__(self, street: Any, random: np.random.Generator) -> None:
         self.street, self.random = street, random
         self.items: list[Item] = []
         self.grounds: list[GroundItem] = []
@@ -133,7 +133,7 @@ def draw_edits(
 
     The street's lists are used up.
     """
-    ledger = _Ledger(street, random)
+    ledger = Ledger(street, random)
     if counts is not None:
         for name, edit in _EDITS.items():
             low, high = getattr(counts, name)
@@ -154,20 +154,20 @@ def _is_detached(placed: Placed) -> bool:
     return isinstance(placed.thing, House) and placed.thing.bays == 3
 
 
-def _add_building(ledger: _Ledger) -> None:
+def _add_building(ledger: Ledger) -> None:
     plot = ledger.take(ledger.street.plots)
     if plot is not None:
         house = draw_house(ledger.random, min(plot.width - 2.5, 9.5))
         ledger.add(None, Placed(house, plot.x, plot.side * (FACADE_Y_M + 0.4), plot.yaw), ADDED, "building added")
 
 
-def _remove_building(ledger: _Ledger) -> None:
+def _remove_building(ledger: Ledger) -> None:
     placed = ledger.take(ledger.street.houses, _is_detached)
     if placed is not None:
         ledger.add(placed, None, REMOVED, "building removed")
 
 
-def _extend_building(ledger: _Ledger) -> None:
+def _extend_building(ledger: Ledger) -> None:
     placed = ledger.take(ledger.street.houses, lambda p: _is_house(p) and not p.thing.annexes)
     if placed is None:
         return
@@ -180,7 +180,7 @@ def _extend_building(ledger: _Ledger) -> None:
     ledger.add(placed, after, INCREASED, "building extended", note)
 
 
-def _demolish_annex(ledger: _Ledger) -> None:
+def _demolish_annex(ledger: Ledger) -> None:
     placed = ledger.take(ledger.street.houses, lambda p: _is_house(p) and bool(p.thing.annexes))
     if placed is not None:
         annex = placed.thing.annexes[0]
@@ -190,7 +190,7 @@ def _demolish_annex(ledger: _Ledger) -> None:
         )
 
 
-def _change_storeys(ledger: _Ledger, step: int, label: ChangeLabel, edit: str) -> None:
+def _change_storeys(ledger: Ledger, step: int, label: ChangeLabel, edit: str) -> None:
     placed = ledger.take(ledger.street.houses, lambda p: _is_house(p) and 1 <= p.thing.storeys + step <= 4)
     if placed is not None:
         after = replace(placed.thing, storeys=placed.thing.storeys + step)
@@ -202,19 +202,19 @@ def _is_street_tree(placed: Placed) -> bool:
     return isinstance(placed.thing, Tree) and abs(placed.y) < FACADE_Y_M
 
 
-def _add_tree(ledger: _Ledger) -> None:
+def _add_tree(ledger: Ledger) -> None:
     pit = ledger.take(ledger.street.tree_pits)
     if pit is not None:
         ledger.add(None, replace(pit, thing=draw_tree(ledger.random)), ADDED, "tree added")
 
 
-def _remove_tree(ledger: _Ledger) -> None:
+def _remove_tree(ledger: Ledger) -> None:
     placed = ledger.take(ledger.street.trees, _is_street_tree)
     if placed is not None:
         ledger.add(placed, None, REMOVED, "tree removed")
 
 
-def _grow_tree(ledger: _Ledger) -> None:
+def _grow_tree(ledger: Ledger) -> None:
     placed = ledger.take(ledger.street.trees, _is_street_tree)
     if placed is not None:
         tree, factor = placed.thing, ledger.random.uniform(1.12, 1.4)
@@ -223,7 +223,7 @@ def _grow_tree(ledger: _Ledger) -> None:
         ledger.add(placed, replace(placed, thing=grown), INCREASED, "tree grown", note)
 
 
-def _prune_tree(ledger: _Ledger) -> None:
+def _prune_tree(ledger: Ledger) -> None:
     placed = ledger.take(ledger.street.trees, _is_street_tree)
     if placed is not None:
         tree, factor = placed.thing, ledger.random.uniform(0.6, 0.85)
@@ -233,7 +233,7 @@ def _prune_tree(ledger: _Ledger) -> None:
         ledger.add(placed, replace(placed, thing=pruned), DECREASED, "tree pruned", note)
 
 
-def _cut_hedge(ledger: _Ledger) -> None:
+def _cut_hedge(ledger: Ledger) -> None:
     placed = ledger.take(ledger.street.greenery, lambda p: isinstance(p.thing, Hedge))
     if placed is not None:
         height = placed.thing.height * ledger.random.uniform(0.45, 0.7)
@@ -241,19 +241,19 @@ def _cut_hedge(ledger: _Ledger) -> None:
         ledger.add(placed, replace(placed, thing=replace(placed.thing, height=height)), DECREASED, "hedge cut", note)
 
 
-def _add_vehicle(ledger: _Ledger) -> None:
+def _add_vehicle(ledger: Ledger) -> None:
     slot = ledger.take(ledger.street.slots)
     if slot is not None:
         ledger.add(None, in_slot(draw_car(ledger.random), slot, ledger.random), ADDED, "vehicle added")
 
 
-def _remove_vehicle(ledger: _Ledger) -> None:
+def _remove_vehicle(ledger: Ledger) -> None:
     placed = ledger.take(ledger.street.cars)
     if placed is not None:
         ledger.add(placed, None, REMOVED, "vehicle removed")
 
 
-def _move_vehicle(ledger: _Ledger) -> None:
+def _move_vehicle(ledger: Ledger) -> None:
     slot, placed = ledger.take(ledger.street.slots), ledger.take(ledger.street.cars)
     if slot is not None and placed is not None:
         after = in_slot(placed.thing, slot, ledger.random)
@@ -262,7 +262,7 @@ def _move_vehicle(ledger: _Ledger) -> None:
         )
 
 
-def _replace_vehicle(ledger: _Ledger) -> None:
+def _replace_vehicle(ledger: Ledger) -> None:
     """A vehicle makes room for one of another build in the same slot."""
     placed = ledger.take(ledger.street.cars)
     if placed is not None:
@@ -272,7 +272,7 @@ def _replace_vehicle(ledger: _Ledger) -> None:
         ledger.add_pair(placed, after, "vehicle replaced", note)
 
 
-def _repark_vehicle(ledger: _Ledger) -> None:
+def _repark_vehicle(ledger: Ledger) -> None:
     """The same vehicle in the same slot, not quite as it stood: not a change."""
     placed = ledger.take(ledger.street.cars)
     if placed is not None:
@@ -281,20 +281,20 @@ def _repark_vehicle(ledger: _Ledger) -> None:
         ledger.add(placed, after, UNCHANGED, "vehicle reparked", f"{abs(dx):.1f} m along its slot")
 
 
-def _add_furniture(ledger: _Ledger) -> None:
+def _add_furniture(ledger: Ledger) -> None:
     x = ledger.random.uniform(5, ledger.street.terrain.length - 5)
     side = float(ledger.random.choice([-1.0, 1.0]))
     sign = Sign(ledger.random.uniform(2.2, 2.9), bool(ledger.random.random() < 0.5))
     ledger.add(None, Placed(sign, x, side * 6.75, ledger.random.normal(0, 0.1)), ADDED, "furniture added", sign.kind)
 
 
-def _remove_furniture(ledger: _Ledger) -> None:
+def _remove_furniture(ledger: Ledger) -> None:
     placed = ledger.take(ledger.street.furniture)
     if placed is not None:
         ledger.add(placed, None, REMOVED, "furniture removed", placed.thing.kind)
 
 
-def _change_ground(ledger: _Ledger) -> None:
+def _change_ground(ledger: Ledger) -> None:
     """Fill or dig a vacant plot; where none is left, relay a stretch of the carriageway."""
     random = ledger.random
     plot = ledger.take(ledger.street.plots)
@@ -314,7 +314,7 @@ def _change_ground(ledger: _Ledger) -> None:
     ledger.grounds.append(GroundItem(ledger.new_id(), patch, label, f"ground {verb}", note))
 
 
-_EDITS: dict[str, Callable[[_Ledger], None]] = {
+_EDITS: dict[str, Callable[[Ledger], None]] = {
     "building_added": _add_building,
     "building_removed": _remove_building,
     "annex_demolished": _demolish_annex,

@@ -7,6 +7,7 @@ house. Everything follows from the generator handed in.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -78,6 +79,20 @@ class GroundPatch:
         return np.asarray(self.dz * np.clip(inside / self.rim, 0.0, 1.0))
 
 
+class Ground(Protocol):
+    """The ground that a scene stands on."""
+
+    @property
+    def length(self) -> float:
+        """Extent of the block along x, m."""
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Height without patches, m, of the shape of ``x``."""
+
+    def surface(self, patches: list[GroundPatch], outlines: list[GroundPatch]) -> tuple[Shape, Int64Array]:
+        """Its surface with ``patches`` applied, and for each triangle which of ``outlines`` it lies in (-1 none)."""
+
+
 @dataclass(frozen=True)
 class Terrain:
     """The ground: a slope, long waves, and the street's cross-section.
@@ -143,7 +158,7 @@ class Placed:
     y: float
     yaw: float = 0.0
 
-    def surface(self, terrain: Terrain, foliage: np.random.Generator) -> Shape:
+    def surface(self, terrain: Ground, foliage: np.random.Generator) -> Shape:
         """Its surface in the street's frame, standing on the unpatched ground."""
         z = float(terrain.height(np.array(self.x), np.array(self.y)))
         return self.thing.surface(foliage).placed(self.x, self.y, z, self.yaw)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from loda_pdal.benchmark.simulate.raycast import RayCaster, normals_of
-from loda_pdal.benchmark.simulate.scene import Terrain
+from loda_pdal.benchmark.simulate.scene import Ground
 from loda_pdal.benchmark.simulate.shapes import REFLECTANCE, RETURN_SHARE, Shape
 from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array
 from loda_pdal.model.transform import rotation_matrix
@@ -18,9 +18,32 @@ GRAZING_COSINE = 0.06
 """Below this cosine of the angle of incidence pulses get lost, in proportion."""
 
 
+class Scanner(Protocol):
+    """What a survey needs to know of its scanner: columns of pulses, where they go, and how wrong they are."""
+
+    @property
+    def max_range_m(self) -> float: ...
+
+    @property
+    def noise_m(self) -> float: ...
+
+    @property
+    def dropout(self) -> float: ...
+
+    @property
+    def bright_range_m(self) -> float:
+        """Range at which a return has lost half of its strength."""
+
+    def directions(self, path: Drive, columns: Int64Array) -> FloatArray:
+        """Unit directions of all pulses of the columns, (c * n, 3) in the street's frame, column by column."""
+
+    def can_look(self, directions: FloatArray, heading: FloatArray) -> BoolArray:
+        """Which directions (m, 3) lie in the field of view of a scanner that heads there (m,), rad."""
+
+
 @dataclass(frozen=True)
 class Sensor:
-    """The scanner, its mounting and its errors.
+    """A spinning multi-beam scanner on a vehicle, its mounting and its errors.
 
     ``column_share`` is the share of the scanner's columns that is fired: 1 is every pulse of the real thing, the
     default keeps a block small enough for a test and still dense enough for every stage.
@@ -38,6 +61,17 @@ class Sensor:
     drift_m: float = 0.02
     drift_deg: float = 0.03
     column_share: float = 0.018
+    bright_range_m: float = 40.0
+
+    def directions(self, path: Drive, columns: Int64Array) -> FloatArray:
+        """All beams of columns of the drive."""
+        flat = _beam_directions(self, path.time[columns])
+        return _turned(flat, np.repeat(path.heading[columns], self.n_beams))
+
+    def can_look(self, directions: FloatArray, heading: FloatArray) -> BoolArray:
+        """Directions neither too steep nor too low; the scanner spins, so the heading does not matter."""
+        elevation = np.degrees(np.arcsin(np.clip(directions[:, 2], -1, 1)))
+        return np.asarray(np.abs(elevation) <= self.vertical_deg)
 
 
 class Drive(NamedTuple):
@@ -89,7 +123,7 @@ class Scan(NamedTuple):
 
 
 def drive(
-    sensor: Sensor, terrain: Terrain, lanes: tuple[float, ...], lead_m: float, random: np.random.Generator
+    sensor: Sensor, terrain: Ground, lanes: tuple[float, ...], lead_m: float, random: np.random.Generator
 ) -> Drive:
     """One pass per lane (y of each, m), there and back, from ``lead_m`` before the street to ``lead_m`` after it."""
     passes = [_pass(sensor, terrain, lane, i, lead_m, random) for i, lane in enumerate(lanes)]
@@ -97,7 +131,7 @@ def drive(
 
 
 def _pass(
-    sensor: Sensor, terrain: Terrain, lane: float, index: int, lead_m: float, random: np.random.Generator
+    sensor: Sensor, terrain: Ground, lane: float, index: int, lead_m: float, random: np.random.Generator
 ) -> Drive:
     """One drive along the street; right-hand lanes (y < 0) go towards +x."""
     length = terrain.length + 2 * lead_m
@@ -129,7 +163,7 @@ def _wander(time: FloatArray, rms: float, random: np.random.Generator) -> FloatA
     return np.asarray(rms * (total - total.mean(axis=0)))
 
 
-def scan(sensor: Sensor, scene: Shape, path: Drive, random: np.random.Generator) -> Scan:
+def scan(sensor: Scanner, scene: Shape, path: Drive, random: np.random.Generator) -> Scan:
     """What the sensor reports of ``scene`` along ``path``."""
     caster, normals = RayCaster(scene), normals_of(scene)
     columns = np.arange(len(path.time))
@@ -146,7 +180,7 @@ _COLUMNS_AT_ONCE = 8192
 
 
 def _scan_columns(
-    sensor: Sensor,
+    sensor: Scanner,
     scene: Shape,
     caster: RayCaster,
     normals: FloatArray,
@@ -155,8 +189,8 @@ def _scan_columns(
     random: np.random.Generator,
 ) -> Scan:
     """Returns of some columns of the drive."""
-    column = np.repeat(columns, sensor.n_beams)
-    directions = _turned(_beam_directions(sensor, path.time[columns]), path.heading[column])
+    directions = sensor.directions(path, columns)
+    column = np.repeat(columns, len(directions) // len(columns) if len(columns) else 0)
     hits = caster.cast(path.position[column], directions, sensor.max_range_m)
     noise = random.normal(0.0, sensor.noise_m, len(column))
     luck, speckle = random.random(len(column)), random.normal(1.0, 0.08, len(column))
@@ -170,13 +204,13 @@ def _scan_columns(
     pose, range_m, primitive = column[kept], hits.range_m[kept], hits.primitive[kept].astype(np.int64)
     measured = directions[kept] * (range_m + noise[kept])[:, None]
     xyz = path.recorded[pose] + measured + np.cross(path.turn[pose], measured)
-    brightness = REFLECTANCE[scene.material[primitive]] * cosine / (1.0 + (range_m / 40.0) ** 2)
+    brightness = REFLECTANCE[scene.material[primitive]] * cosine / (1.0 + (range_m / sensor.bright_range_m) ** 2)
     intensity = np.clip(60000.0 * brightness * speckle[kept], 1, 65535).astype(np.uint16)
     return Scan(xyz, primitive, path.time[pose], intensity)
 
 
 def sees(
-    sensor: Sensor,
+    sensor: Scanner,
     caster: RayCaster,
     path: Drive,
     targets: FloatArray,
@@ -196,8 +230,8 @@ def sees(
     offset = np.tile(targets, (len(station), 1)) - origins
     distance = np.linalg.norm(offset, axis=1)
     directions = offset / np.maximum(distance, 1e-9)[:, None]
-    elevation = np.degrees(np.arcsin(np.clip(directions[:, 2], -1, 1)))
-    candidate = np.flatnonzero((distance < sensor.max_range_m) & (np.abs(elevation) <= sensor.vertical_deg))
+    is_in_view = sensor.can_look(directions, np.repeat(path.heading[station], len(targets)))
+    candidate = np.flatnonzero((distance < sensor.max_range_m) & is_in_view)
     hits = caster.cast(origins[candidate], directions[candidate], np.maximum(distance[candidate] - margin_m, 0.0))
     is_seen = np.zeros(len(offset), dtype=bool)
     is_seen[candidate] = (hits.primitive < 0) | see_through[hits.primitive]

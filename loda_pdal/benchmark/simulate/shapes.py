@@ -222,3 +222,23 @@ def leaves(centres: FloatArray, radius: float, random: np.random.Generator) -> S
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     radii = radius * random.uniform(0.7, 1.3, size=(len(centres), 1))
     return of_discs(np.hstack([centres, normals, radii]))
+
+
+def distance_to_triangles(points: FloatArray, triangles: FloatArray) -> FloatArray:
+    """Distance (n,) of points (n, 3) to the nearest of the triangles (t, 3, 3), m; infinity where there is none."""
+    nearest = np.full(len(points), np.inf)
+    for a, b, c in triangles:
+        edges, normal = np.array([b - a, c - b, a - c]), np.cross(b - a, c - a)
+        length = np.linalg.norm(normal)
+        if length < 1e-12:
+            continue
+        normal /= length
+        offset = points - a
+        is_over = np.ones(len(points), dtype=bool)
+        for corner, edge in zip((a, b, c), edges, strict=True):
+            along = np.clip((points - corner) @ edge / (edge @ edge), 0.0, 1.0)
+            gap = np.linalg.norm(points - corner - along[:, None] * edge, axis=1)
+            nearest = np.minimum(nearest, gap)
+            is_over &= np.cross(edge, points - corner) @ normal >= 0
+        nearest[is_over] = np.minimum(nearest[is_over], np.abs(offset[is_over] @ normal))
+    return nearest
