@@ -26,6 +26,7 @@ from loda_pdal.io.las_writer import write_cloud
 from loda_pdal.io.plain import to_json
 from loda_pdal.io.raster import write_lod_raster
 from loda_pdal.io.report import write_report
+from loda_pdal.io.reviews import read_reviews
 from loda_pdal.io.run_json import run_document
 from loda_pdal.io.transform import write_transform
 from loda_pdal.model.errors import OutputError
@@ -113,7 +114,7 @@ def write_outputs(
     folder : str or Path
         Made where it does not exist.
     overwrite : bool
-        Replace an earlier result.
+        Replace an earlier result; its reviews are kept (see `loda_pdal.io.reviews`).
     keep_frames : bool
         Leave before-points where their own survey has them, instead of moving them onto the after epoch.
     run_info : mapping, optional
@@ -152,10 +153,11 @@ def write_outputs(
         T_after_before = registration.T_after_before
         if with_cloud:
             write_cloud(staging / names["cloud"], surveys, result.points, T_after_before, keep_frames=keep_frames)
-        write_geopackage(staging / names["changes"], result, frame, run)
+        earlier = read_reviews(folder / names["changes"], frame.crs_wkt)
+        reviews = write_geopackage(staging / names["changes"], result, frame, run, earlier)
         write_lod_raster(staging / names["lod95"], result.lod, registration.T_after_frame, frame)
         write_transform(staging / names["transform"], registration, frame)
-        write_report(staging / names["report"], result, surveys, run)
+        write_report(staging / names["report"], result, surveys, run, reviews)
         (staging / names["run"]).write_text(to_json(run), encoding="utf-8")
         for name in names.values():
             _flush(staging / name)
