@@ -56,7 +56,7 @@ def write_copc(source: Path, target: Path) -> None:
     source : Path
         LAS 1.4 with a point format of 6 to 8; is read whole.
     target : Path
-        Ends in ``.copc.laz``; replaced where it exists.
+        Ends in ``.copc.laz``; replaced where it exists. May be the source itself.
     """
     las = laspy.read(source)
     if las.header.point_format.id not in POINT_FORMATS:
