@@ -20,6 +20,7 @@ from pyproj import CRS
 from loda_pdal.io.colours import LABEL_COLOURS, rgb
 from loda_pdal.io.geopackage import run_rows, to_map_polygons, write_geopackage
 from loda_pdal.io.qml import label_style
+from loda_pdal.io.qml_review import ALIASES
 from loda_pdal.model.frame import LocalFrame
 from loda_pdal.model.labels import ChangeLabel
 from loda_pdal.model.pair import Pair
@@ -251,6 +252,10 @@ def test_styles_give_every_label_the_colour_of_the_one_table(package: Path) -> N
     assert kinds["Unchanged"] == ["SimpleLine"]
     assert kinds["Added"] == ["SimpleFill"]
     assert "confidence" in qml and "confidence" not in label_style(opacity_by_confidence=False)
+
+
+def test_the_form_names_every_column_once() -> None:
+    assert sorted([*ALIASES, "label_code"]) == sorted(OBJECT_COLUMNS)
 
 
 def test_all_styles_are_well_formed(package: Path) -> None:

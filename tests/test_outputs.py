@@ -21,6 +21,7 @@ from io_samples import make_result, make_surveys
 from loda_pdal.io import outputs
 from loda_pdal.io.outputs import OUTPUTS, check_output_folder, write_outputs
 from loda_pdal.io.plain import to_json, to_plain
+from loda_pdal.io.report_folder import rebuild_report
 from loda_pdal.model.errors import OutputError
 from loda_pdal.model.pair import Pair
 from loda_pdal.model.survey import Survey
@@ -144,10 +145,20 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.Mon
     assert caught.value.code == "output-unwritable"
 
 
-def test_copc_is_refused_by_name_before_anything_is_written(tmp_path: Path, surveys: Pair[Survey]) -> None:
-    error = refused(make_result(surveys), surveys, tmp_path / "out", cloud_format="copc.laz")
+def test_an_unknown_cloud_format_is_refused_before_anything_is_written(tmp_path: Path, surveys: Pair[Survey]) -> None:
+    error = refused(make_result(surveys), surveys, tmp_path / "out", cloud_format="e57")
     assert error.code == "cloud-format" and "copc" in str(error)
     assert not (tmp_path / "out").exists()
+
+
+def test_copc_in_place_of_laz(tmp_path: Path, surveys: Pair[Survey]) -> None:
+    result = make_result(surveys)
+    plain = write_outputs(result, surveys, tmp_path / "out")
+    copc = write_outputs(result, surveys, tmp_path / "copc", cloud_format="copc")
+    assert set(contents(tmp_path / "copc")) == NAMES - {"changes.laz"} | {"changes.copc.laz"}
+    points = [np.sort(laspy.read(outputs["cloud"]).points.array, order=["X", "Y", "Z"]) for outputs in (plain, copc)]
+    assert points[0].tobytes() == points[1].tobytes()
+    assert rebuild_report(tmp_path / "copc").is_file()
 
 
 # Whole or not at all

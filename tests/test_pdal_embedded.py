@@ -52,6 +52,25 @@ def copy_pipeline(folder: Path, **writer: Any) -> Path:
     return path
 
 
+def test_a_copc_name_gives_copc(tmp_path: Path) -> None:
+    before = make_survey(tmp_path / "in.las", 1)
+    run_pipeline(copy_pipeline(tmp_path, filename=str(tmp_path / "out.copc.laz"), scale_x=0.001), engine="embedded")
+    with laspy.CopcReader.open(tmp_path / "out.copc.laz") as reader:
+        assert sorted(reader.query()["Own"]) == sorted(before["Own"])
+    assert {path.name for path in tmp_path.iterdir()} == {"in.las", "copy.json", "out.copc.laz"}
+
+
+def test_our_own_pipelines_go_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    make_survey(tmp_path / "before.laz", 1)
+    make_survey(tmp_path / "after.laz", 2)
+    done = run_pipeline("register", {"stage.output.filename": "moved.las"}, engine="embedded", validate=True)
+    assert done.outputs == [Path("moved.las")]
+    (tmp_path / "register").write_text("[]")
+    with pytest.raises(PipelineError, match="no list of stages"):  # a file of that name goes first
+        run_pipeline("register", engine="embedded", validate=True)
+
+
 @pytest.mark.parametrize("point_format", [0, 1, 3, 6, 7, 8])
 def test_every_field_survives_reading_and_writing(point_format: int, tmp_path: Path) -> None:
     before = make_survey(tmp_path / "in.las", 1, point_format)
@@ -139,7 +158,7 @@ OWN_CODE = {"type": "filters.python", "module": "m", "function": "run"}
         (builder.python_stage("lod") | {"add_dimension": "LoD95=half"}, "is not NAME=TYPE"),
         (builder.python_stage("lod") | {"pdalargs": {"rum": "x"}}, "unknown name 'rum'"),
         (builder.python_stage("lod") | {"module": ""}, "no module"),
-        ({"type": "writers.las", "filename": "x.copc.laz"}, "is not a .las or .laz file"),
+        ({"type": "writers.las", "filename": "x.e57"}, "is not a .las or .laz file"),
         ({"type": "writers.las", "filename": "nowhere/x.laz"}, "no folder"),
         ({"type": "writers.las", "filename": "x.laz", "scale_x": "fine"}, "not a number"),
         ({"type": "writers.las", "filename": "x.laz", "extra_dims": "Own=uint8"}, "all extra dimensions or none"),

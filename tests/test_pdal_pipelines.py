@@ -370,6 +370,7 @@ def test_the_command_of_the_documentation_works_as_it_stands(
     ]
     subprocess.run(command, cwd=tmp_path, check=True)
     assert (tmp_path / "loda_run" / "register.npz").is_file()
+    assert (tmp_path / "loda_run" / "transform.json").is_file()
     n_points = sum(len(side.change) for side in detected.points)
     assert len(laspy.read(tmp_path / "out.laz").points) == n_points
 

@@ -33,6 +33,13 @@ if TYPE_CHECKING:
     "--max-memory", type=click.FloatRange(min=0, min_open=True), metavar="GB", help="Memory the run may take."
 )
 @click.option("--keep-frames", is_flag=True, help="Do not move the before points onto the after survey.")
+@click.option(
+    "--cloud-format",
+    type=click.Choice(("laz", "las", "copc")),
+    default="laz",
+    show_default=True,
+    help="How the point cloud is written; copc is for viewers and does not keep the order of the points.",
+)
 @options.overwrite
 @options.as_json
 @options.progress
@@ -50,6 +57,7 @@ def detect(
     threads: int | None,
     max_memory: float | None,
     keep_frames: bool,
+    cloud_format: str,
     overwrite: bool,
     as_json: bool,
     progress_kind: str,
@@ -67,7 +75,7 @@ def detect(
         if validate:
             reporter.info("Everything is in order; nothing was computed.")
             return
-        summary, outputs = _run(reporter, surveys, folder, parameters, threads, keep_frames, overwrite)
+        summary, outputs = _run(reporter, surveys, folder, parameters, threads, keep_frames, cloud_format, overwrite)
         reporter.result(outputs, summary)
     if progress_kind == "json":
         return
@@ -114,6 +122,7 @@ def _run(
     parameters: Parameters,
     threads: int | None,
     keep_frames: bool,
+    cloud_format: str,
     overwrite: bool,
 ) -> tuple[dict[str, Any], dict[str, Path]]:
     """The run itself: its summary and the files it wrote."""
@@ -140,7 +149,15 @@ def _run(
         "started": started.isoformat(timespec="seconds"),
         "preset": parameters.name,
     }
-    outputs = write_outputs(result, surveys, folder, overwrite=overwrite, keep_frames=keep_frames, run_info=run_info)
+    outputs = write_outputs(
+        result,
+        surveys,
+        folder,
+        overwrite=overwrite,
+        keep_frames=keep_frames,
+        run_info=run_info,
+        cloud_format=cloud_format,
+    )
     reporter.progress(total, total, "done")
     return summary, outputs
 

@@ -8,9 +8,10 @@ from typing import Any
 
 import click
 
+import loda_pdal
 from loda_pdal.cli import options, verbosity
 from loda_pdal.model.errors import OutputError
-from loda_pdal.params import Parameters
+from loda_pdal.params import PRESETS, Parameters
 
 
 @click.command(short_help="Print or write all parameters.")
@@ -45,6 +46,8 @@ def _described(chosen: Parameters) -> dict[str, Any]:
         values = entry._asdict()
         stage["parameters"].append({key: values[key] for key in values if key not in ("stage", "stage_doc")})
     return {
+        "version": loda_pdal.__version__,
+        "presets": {name: Parameters.preset(name).to_dict() for name in PRESETS},
         "name": chosen.name,
         "adapts_to_spacing": chosen.adapts_to_spacing,
         "stages": list(stages.values()),

@@ -38,7 +38,7 @@ def pipeline(
     progress_kind: str,
     validate: bool,
 ) -> None:
-    """Run the PDAL pipeline FILE.
+    """Run the PDAL pipeline FILE, or one of ours by its name: change, register, lod, segment, change_only.
 
     Options of its stages are set as PDAL takes them: --stage.TAG.option=value or --readers.las.option=value.
     """

@@ -5,6 +5,7 @@ GeoPackage 1.2 without a write-ahead log, in the map coordinates of the after ep
 
 from __future__ import annotations
 
+import logging
 import sqlite3
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -16,13 +17,18 @@ import numpy as np
 import shapely
 
 from loda_pdal.io.plain import to_plain
-from loda_pdal.io.qml import class_style, label_style, outline_style
+from loda_pdal.io.qml import change_style, class_style, label_style, outline_style
+from loda_pdal.io.reviews import EARLIER_LAYER, STATUSES, Review, match_reviews
 from loda_pdal.model.frame import LocalFrame
+from loda_pdal.model.labels import ChangeLabel
 from loda_pdal.model.records import ChangeResult, GroundChangeRecord, InstanceRecord, ObjectRecord
+
+logger = logging.getLogger(__name__)
 
 VERSION = "1.2"
 
 _DTYPES = {"int": "int64", "code": "int32", "float": "float64", "text": "object", "time": "datetime64[ms]"}
+_UTC = 100  # in GDAL's count of time zones
 
 
 class Column(NamedTuple):
@@ -67,12 +73,19 @@ OBJECT_COLUMNS: tuple[Column, ...] = (
     _field("z_min_m", "float"),
     _field("z_max_m", "float"),
     _field("reason", "text"),
-    Column("review_status", "text", lambda record: "unreviewed"),
-    Column("reviewer", "text", lambda record: None),
-    Column("reviewed_at", "time", lambda record: None),
-    Column("review_note", "text", lambda record: None),
 )
-"""Columns of the layers changes and objects, in order; the last four are for whoever checks the result."""
+"""Columns of the layers changes and objects, in order; four more are for whoever checks the result."""
+
+EARLIER_COLUMNS: tuple[Column, ...] = (
+    _field("object_id", "int"),
+    _field("label", "text"),
+    _field("object_class", "text"),
+    Column("review_status", "text", lambda review: review.status),
+    _field("reviewer", "text"),
+    _field("reviewed_at", "time"),
+    Column("review_note", "text", lambda review: review.note),
+)
+"""Columns of the layer earlier_reviews."""
 
 GROUND_COLUMNS: tuple[Column, ...] = (
     _field("ground_change_id", "int"),
@@ -111,7 +124,31 @@ RUN_COLUMNS: tuple[Column, ...] = (
 )
 
 
-def write_geopackage(path: Path, result: ChangeResult, frame: LocalFrame, run: Mapping[str, Any]) -> None:
+def review_columns(reviews: Mapping[int, Review | None]) -> tuple[Column, ...]:
+    """The four columns of a review, by ``object_id`` of the record; blank where it has none."""
+
+    def field(name: str, kind: str, attribute: str, blank: str | None = None) -> Column:
+        def value(record: Any) -> Any:
+            review = reviews.get(record.object_id)
+            return blank if review is None else getattr(review, attribute)
+
+        return Column(name, kind, value)
+
+    return (
+        field("review_status", "text", "status", STATUSES[0]),
+        field("reviewer", "text", "reviewer"),
+        field("reviewed_at", "time", "reviewed_at"),
+        field("review_note", "text", "note"),
+    )
+
+
+def write_geopackage(
+    path: Path,
+    result: ChangeResult,
+    frame: LocalFrame,
+    run: Mapping[str, Any],
+    earlier: Sequence[Review] = (),
+) -> dict[int, Review]:
     """Write all layers and their styles.
 
     Parameters
@@ -124,15 +161,43 @@ def write_geopackage(path: Path, result: ChangeResult, frame: LocalFrame, run: M
         From local metres to map coordinates, and the CRS.
     run : mapping
         What run.json holds; becomes the rows of layer ``run``.
+    earlier : sequence of Review
+        Reviews of the result that this one replaces, outlines in map coordinates.
+
+    Returns
+    -------
+    dict of int to Review
+        Those that were carried over, by object_id. The others are in layer ``earlier_reviews``.
     """
+    outlines = dict(zip((o.object_id for o in result.objects), _footprints(result.objects, frame), strict=True))
+    labels = [o.label.title for o in result.objects]
+    carried, unmatched = match_reviews(earlier, list(outlines), labels, list(outlines.values()))
     with _unhurried():
+        _write_objects(path, result, outlines, carried, frame)
         _write_layers(path, result, frame, run)
+        if unmatched:
+            logger.warning(
+                "%d of %d earlier reviews match no object of this result; layer %s keeps them.",
+                len(unmatched),
+                len(earlier),
+                EARLIER_LAYER,
+            )
+            _write_layer(path, EARLIER_LAYER, EARLIER_COLUMNS, unmatched, [r.footprint for r in unmatched], frame)
     _embed_styles(path)
+    return carried
+
+
+def _write_objects(
+    path: Path, result: ChangeResult, outlines: Mapping[int, Any], reviews: Mapping[int, Review], frame: LocalFrame
+) -> None:
+    """Layers changes and objects. A change is reviewed in ``changes``, so ``objects`` says it of the others only."""
+    of_unchanged = {o.object_id: reviews.get(o.object_id) for o in result.objects if o.label is ChangeLabel.UNCHANGED}
+    for layer, objects, known in (("changes", result.changes, reviews), ("objects", result.objects, of_unchanged)):
+        columns = (*OBJECT_COLUMNS, *review_columns(known))
+        _write_layer(path, layer, columns, objects, [outlines[o.object_id] for o in objects], frame)
 
 
 def _write_layers(path: Path, result: ChangeResult, frame: LocalFrame, run: Mapping[str, Any]) -> None:
-    for layer, objects in (("changes", result.changes), ("objects", result.objects)):
-        _write_layer(path, layer, OBJECT_COLUMNS, objects, _footprints(objects, frame), frame)
     ground = result.ground_changes
     _write_layer(path, "ground_changes", GROUND_COLUMNS, ground, _footprints(ground, frame), frame)
     for layer, instances in (
@@ -244,6 +309,7 @@ def _write_layer(
             driver="GPKG",
             geometry_type=None if geometries is None else geometry_type,
             crs=None if geometries is None else frame.crs_wkt,
+            gdal_tz_offsets={c.name: np.full(len(records), _UTC, dtype=np.int8) for c in columns if c.kind == "time"},
             dataset_options=None if path.exists() else {"VERSION": VERSION},
         )
 
@@ -274,7 +340,7 @@ def _embed_styles(path: Path) -> None:
     """The table from which QGIS takes the default style of each layer."""
     by_label, by_class = label_style(opacity_by_confidence=False), class_style()
     styles = {
-        "changes": label_style(opacity_by_confidence=True),
+        "changes": change_style(),
         "objects": by_label,
         "ground_changes": by_label,
         "instances_before": by_class,

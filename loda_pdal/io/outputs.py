@@ -21,11 +21,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from loda_pdal.io.copc import write_copc
 from loda_pdal.io.geopackage import write_geopackage
 from loda_pdal.io.las_writer import write_cloud
 from loda_pdal.io.plain import to_json
 from loda_pdal.io.raster import write_lod_raster
 from loda_pdal.io.report import write_report
+from loda_pdal.io.reviews import read_reviews
 from loda_pdal.io.run_json import run_document
 from loda_pdal.io.transform import write_transform
 from loda_pdal.model.errors import OutputError
@@ -35,7 +37,7 @@ from loda_pdal.model.survey import Survey
 
 logger = logging.getLogger(__name__)
 
-CLOUD_FORMATS = ("laz", "las")
+CLOUD_FORMATS = ("laz", "las", "copc")
 
 CLOUDS = ("changes.laz", "changes.las", "changes.copc.laz")
 OUTPUTS = ("changes.gpkg", *CLOUDS, "lod95.tif", "transform.json", "report.html", "run.json")
@@ -113,13 +115,13 @@ def write_outputs(
     folder : str or Path
         Made where it does not exist.
     overwrite : bool
-        Replace an earlier result.
+        Replace an earlier result; its reviews are kept (see `loda_pdal.io.reviews`).
     keep_frames : bool
         Leave before-points where their own survey has them, instead of moving them onto the after epoch.
     run_info : mapping, optional
         What a face knows of the run, for run.json and the report.
     cloud_format : str
-        ``laz`` or ``las``.
+        ``laz``, ``las`` or ``copc`` (for viewers; does not keep the order of the points).
     with_cloud : bool
         Write the point cloud; without it for a face that writes its points itself.
 
@@ -132,13 +134,13 @@ def write_outputs(
     if cloud_format not in CLOUD_FORMATS:
         raise OutputError(
             f"Point clouds are not written as {cloud_format!r}.",
-            f"Use {' or '.join(CLOUD_FORMATS)}; `pdal translate` makes COPC of either.",
+            f"Use {', '.join(CLOUD_FORMATS)}.",
             "cloud-format",
         )
     check_output_folder(folder, overwrite)
     names = {
         "changes": "changes.gpkg",
-        "cloud": f"changes.{cloud_format}",
+        "cloud": "changes.copc.laz" if cloud_format == "copc" else f"changes.{cloud_format}",
         "lod95": "lod95.tif",
         "transform": "transform.json",
         "report": "report.html",
@@ -151,11 +153,15 @@ def write_outputs(
         run = run_document(result, surveys, run_info) | {"keep_frames": keep_frames}
         T_after_before = registration.T_after_before
         if with_cloud:
-            write_cloud(staging / names["cloud"], surveys, result.points, T_after_before, keep_frames=keep_frames)
-        write_geopackage(staging / names["changes"], result, frame, run)
+            plain = staging / ("changes.las" if cloud_format == "copc" else names["cloud"])
+            write_cloud(plain, surveys, result.points, T_after_before, keep_frames=keep_frames)
+            if cloud_format == "copc":
+                write_copc(plain, staging / names["cloud"])
+        earlier = read_reviews(folder / names["changes"], frame.crs_wkt)
+        reviews = write_geopackage(staging / names["changes"], result, frame, run, earlier)
         write_lod_raster(staging / names["lod95"], result.lod, registration.T_after_frame, frame)
         write_transform(staging / names["transform"], registration, frame)
-        write_report(staging / names["report"], result, surveys, run)
+        write_report(staging / names["report"], result, surveys, run, reviews)
         (staging / names["run"]).write_text(to_json(run), encoding="utf-8")
         for name in names.values():
             _flush(staging / name)

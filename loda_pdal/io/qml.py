@@ -7,6 +7,7 @@ from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 from loda_pdal.io.colours import CLASS_COLOURS, LABEL_COLOURS, rgb
+from loda_pdal.io.qml_review import CATEGORIES, review_elements
 from loda_pdal.model.labels import OBJECT_CLASSES, ChangeLabel
 
 LEAST_OPACITY = 45.0
@@ -31,17 +32,22 @@ class Category(NamedTuple):
     fill: str = "solid"
 
 
-def label_style(*, opacity_by_confidence: bool) -> str:
+def change_style() -> str:
+    """QML of layer ``changes``: colours by label, opacity by confidence, labels, map tip and the form for reviewing."""
+    return label_style(opacity_by_confidence=True, more=review_elements(), categories=CATEGORIES)
+
+
+def label_style(*, opacity_by_confidence: bool, more: str = "", categories: str = "Symbology") -> str:
     """QML that colours polygons by ``label``: Undetermined is hatched, Unchanged is an outline."""
     fills = {ChangeLabel.UNDETERMINED: "hatch", ChangeLabel.UNCHANGED: "none"}
-    categories = [Category(x.title, x.title, LABEL_COLOURS[x], fills.get(x, "solid")) for x in _LEGEND]
-    return _categorised("label", categories, opacity_by_confidence)
+    legend = [Category(x.title, x.title, LABEL_COLOURS[x], fills.get(x, "solid")) for x in _LEGEND]
+    return _document(_categorised("label", legend, opacity_by_confidence), more, categories)
 
 
 def class_style() -> str:
     """QML that colours polygons by ``object_class``."""
     categories = [Category(c.title, c.title.capitalize(), CLASS_COLOURS[c]) for c in OBJECT_CLASSES]
-    return _categorised("object_class", categories, False)
+    return _document(_categorised("object_class", categories, False))
 
 
 def outline_style() -> str:
@@ -58,16 +64,16 @@ def _categorised(attribute: str, categories: Iterable[Category], opacity_by_conf
             f'label={quoteattr(category.title)} render="true"/>'
         )
         symbols.append(_symbol(str(number), _layers(category), opacity_by_confidence and category.fill == "solid"))
-    return _document(
+    return (
         f'<renderer-v2 type="categorizedSymbol" attr="{attribute}" symbollevels="0" enableorderby="0">'
         f"<categories>{''.join(entries)}</categories><symbols>{''.join(symbols)}</symbols></renderer-v2>"
     )
 
 
-def _document(renderer: str) -> str:
+def _document(renderer: str, more: str = "", categories: str = "Symbology") -> str:
     return (
         "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
-        f'<qgis version="3.34.0" styleCategories="Symbology">{renderer}'
+        f'<qgis version="3.34.0" styleCategories="{categories}">{renderer}{more}'
         "<blendMode>0</blendMode><featureBlendMode>0</featureBlendMode><layerOpacity>1</layerOpacity></qgis>"
     )
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date
 from importlib.resources import files
@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 
 from loda_pdal.io.colours import LABEL_COLOURS
 from loda_pdal.io.report_pictures import Scene, Shape, ground_pictures, map_svg, object_pictures
+from loda_pdal.io.reviews import Review
 from loda_pdal.io.summary import is_changed, summarise
 from loda_pdal.kernels.parallel import run_ranges
 from loda_pdal.model.cloud import FloatArray
@@ -94,7 +95,13 @@ class ReportData:
     reviews: dict[int, str] = field(default_factory=dict)
 
 
-def write_report(path: Path, result: ChangeResult, surveys: Pair[Survey], run: dict[str, Any]) -> None:
+def write_report(
+    path: Path,
+    result: ChangeResult,
+    surveys: Pair[Survey],
+    run: dict[str, Any],
+    reviews: Mapping[int, Review] | None = None,
+) -> None:
     """Write the report of a run.
 
     Parameters
@@ -107,6 +114,8 @@ def write_report(path: Path, result: ChangeResult, surveys: Pair[Survey], run: d
         What it was found in.
     run : dict
         What run.json holds (`loda_pdal.io.run_json.run_document`); shown in the folded part.
+    reviews : mapping of int to Review, optional
+        What a reviewer noted, by object_id.
     """
     data = ReportData(
         summarise(result, surveys),
@@ -117,6 +126,7 @@ def write_report(path: Path, result: ChangeResult, surveys: Pair[Survey], run: d
         surveys.after.frame,
         result.parameters,
         run,
+        {number: review.sentence for number, review in (reviews or {}).items()},
     )
     path.write_text(render(data), encoding="utf-8")
 

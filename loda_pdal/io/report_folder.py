@@ -18,6 +18,7 @@ from lazrs import LazrsError
 from pyogrio.errors import DataLayerError, DataSourceError
 
 from loda_pdal.io.report import ReportData, render
+from loda_pdal.io.reviews import Review
 from loda_pdal.io.transform import read_map_transform
 from loda_pdal.model.cloud import FloatArray, Int64Array
 from loda_pdal.model.errors import InputError, OutputError
@@ -136,12 +137,8 @@ def _objects(path: Path, frame: LocalFrame) -> tuple[list[ObjectRecord], dict[in
         values["object_class"] = ObjectClass[str(row["object_class"]).upper()]
         values["footprint"] = _to_local(row["footprint"], frame)
         objects.append(ObjectRecord(**values))
-    reviews = {}
-    for row in _rows(path, "changes"):
-        if row["review_status"] not in (None, "", "unreviewed"):
-            signed = ", ".join(str(row[key]) for key in ("reviewer", "reviewed_at") if row[key])
-            note = f": {row['review_note']}" if row["review_note"] else ""
-            reviews[row["object_id"]] = f"{row['review_status']}{f' ({signed})' if signed else ''}{note}"
+    noted = [Review.of_row(row) for row in _rows(path, "changes")]
+    reviews = {review.object_id: review.sentence for review in noted if not review.is_blank}
     return sorted(objects, key=lambda o: o.object_id), reviews
 
 

@@ -38,7 +38,9 @@ class Stage:
         return f"{self.type} ({self.tag})" if self.tag else self.type
 
 
-def read_stages(path: Path, overrides: Mapping[str, str] | None = None) -> list[Stage]:
+def read_stages(
+    path: Path, overrides: Mapping[str, str] | None = None, document: dict[str, Any] | None = None
+) -> list[Stage]:
     """Stages of a pipeline file in its order, with overrides applied.
 
     Parameters
@@ -47,8 +49,10 @@ def read_stages(path: Path, overrides: Mapping[str, str] | None = None) -> list[
         JSON, an array or an object with the key ``pipeline``.
     overrides : mapping, optional
         ``{"stage.TAG.option": value}`` or ``{"readers.las.option": value}``, as PDAL takes them after ``--``.
+    document : dict, optional
+        What the file holds, where it is known already; ``path`` then only names it.
     """
-    stages = _connected(_entries(path), path)
+    stages = _connected(_entries(_document(path) if document is None else document, path), path)
     for key, value in (overrides or {}).items():
         stages = _overridden(stages, key, value)
     return stages
@@ -72,9 +76,9 @@ def _free_tag(position: int, taken: set[str]) -> str:
     return tag
 
 
-def _entries(path: Path) -> list[dict[str, Any]]:
+def _document(path: Path) -> Any:
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise PipelineError(
             f"{path}: cannot be read ({error.strerror or error}).", "Check the path.", "pipeline-unreadable"
@@ -83,6 +87,9 @@ def _entries(path: Path) -> list[dict[str, Any]]:
         raise PipelineError(
             f"{path}: is not valid JSON ({error}).", "Correct the file.", "pipeline-unreadable"
         ) from error
+
+
+def _entries(document: Any, path: Path) -> list[dict[str, Any]]:
     entries = document.get("pipeline") if isinstance(document, dict) else document
     if not isinstance(entries, list) or not entries:
         raise PipelineError(f"{path}: holds no list of stages.", 'Write {"pipeline": [...]}.', "pipeline-unreadable")

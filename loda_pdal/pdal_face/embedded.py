@@ -211,7 +211,7 @@ def _prepare_writer(stage: Stage) -> Prepared:
     axes = tuple(f"{what}_{axis}" for what in ("scale", "offset") for axis in "xyz")
     _check_options(stage, ("filename", "extra_dims", "minor_version", "dataformat_id", "compression", "forward", *axes))
     path = _filename(stage)
-    if path.suffix.lower() not in (".las", ".laz") or path.name.lower().endswith(".copc.laz"):
+    if path.suffix.lower() not in (".las", ".laz"):
         raise PipelineError(f"{stage.title}: {path} is not a .las or .laz file.", "Change the name.", "option-invalid")
     if not path.parent.is_dir():
         raise PipelineError(f"{stage.title}: there is no folder {path.parent}.", "Make it first.", "output-unwritable")

@@ -58,14 +58,18 @@ def _epoch(name: str, number: int) -> Callable[[Call], None]:
     return work
 
 
-def _step(name: str, values: Callable[[Run], Values] | None = None) -> Callable[[Call], None]:
-    """Makes sure that a step is done, and writes what it says of every point."""
+def _step(
+    name: str, values: Callable[[Run], Values] | None = None, file: Callable[[Run], None] | None = None
+) -> Callable[[Call], None]:
+    """Makes sure that a step is done, and writes what it says of every point and to a file of its own."""
 
     def work(call: Call) -> None:
         run = Run(call)
         run[name]
         if values:
             run.write(values(run))
+        if file:
+            file(run)
 
     return work
 
@@ -82,9 +86,9 @@ def _move(call: Call) -> None:
 ENTRIES: dict[str, Callable[[Call], None]] = {
     "before": _epoch("before", 0),
     "after": _epoch("after", 1),
-    "register": _step("register"),
+    "register": _step("register", file=Run.write_transform),
     "ground": _step("ground", steps.heights),
-    "lod": _step("lod", steps.limits),
+    "lod": _step("lod", steps.limits, Run.write_lod_raster),
     "proxies": _step("proxies"),
     "superpoints": _step("superpoints", steps.superpoint_numbers),
     "semantics": _step("semantics", steps.classes),

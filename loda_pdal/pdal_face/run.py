@@ -27,7 +27,9 @@ from loda_pdal.assembly import height_of_points, spread
 from loda_pdal.io.crs import DeclaredCrs, MapCrs, common_crs
 from loda_pdal.io.las import check_coverage, common_frame
 from loda_pdal.io.outputs import write_outputs
+from loda_pdal.io.raster import write_lod_raster
 from loda_pdal.io.run_folder import RunFolder
+from loda_pdal.io.transform import write_transform
 from loda_pdal.model import dimensions as dims
 from loda_pdal.model.cloud import BoolArray, FloatArray, VoxelCloud
 from loda_pdal.model.dimensions import Dimension
@@ -187,6 +189,17 @@ class Run:
             column = np.empty(len(self._is_before), dtype=dimension.dtype)
             column[self._is_before], column[~self._is_before] = pair.before, pair.after
             self._call.points.write_dimension(dimension, column)
+
+    def write_transform(self) -> None:
+        """The move between the epochs as transform.json in the run folder."""
+        if self._folder is not None:
+            write_transform(self._folder.path / "transform.json", self["register"], self.frame)
+
+    def write_lod_raster(self) -> None:
+        """The limit of detection as lod95.tif in the run folder."""
+        if self._folder is not None:
+            T_after_frame = self["register"].T_after_frame
+            write_lod_raster(self._folder.path / "lod95.tif", self["lod"], T_after_frame, self.frame)
 
     def move_before(self) -> None:
         """Move the before-points onto the after epoch: X, Y and Z change."""

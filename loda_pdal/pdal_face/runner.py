@@ -13,6 +13,7 @@ from pathlib import Path
 from loda_pdal.kernels.parallel import thread_count
 from loda_pdal.model import errors
 from loda_pdal.model.errors import LodaError, OutputError, PipelineError
+from loda_pdal.pdal_face import builder
 from loda_pdal.pdal_face.document import Stage, read_stages, to_document
 from loda_pdal.pdal_face.partial import PartialFile, discard_partial_files
 from loda_pdal.pdal_face.program import find_pdal, pdal_version
@@ -64,7 +65,7 @@ def run_pipeline(
     Parameters
     ----------
     path : str or Path
-        The JSON file.
+        The JSON file, or the name of one of our own pipelines (`builder.CHAINS`) where no such file exists.
     overrides : mapping, optional
         Options in PDAL's spelling without the dashes: ``{"stage.before.filename": "2015.laz"}``.
     engine : str
@@ -76,7 +77,8 @@ def run_pipeline(
     """
     if engine not in ENGINES:
         raise PipelineError(f"There is no engine {engine!r}.", f"Use one of {', '.join(ENGINES)}.", "engine-unknown")
-    stages = read_stages(Path(path), overrides)
+    own = builder.pipeline(str(path)) if str(path) in builder.CHAINS and not Path(path).exists() else None
+    stages = read_stages(Path(path), overrides, own)
     program = find_pdal() if engine != "embedded" else None
     if engine == "pdal" and program is None:
         raise PipelineError(

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from pyproj import CRS
 
+from loda_pdal.io.copc import SUFFIX, write_copc
 from loda_pdal.io.crs import declared_crs
 from loda_pdal.io.las import inspect
 from loda_pdal.io.las_points import map_coordinates
@@ -122,7 +123,7 @@ def write_table(
     offset: tuple[float | None, float | None, float | None],
     with_extra: bool,
 ) -> None:
-    """Write LAS, or LAZ where the name ends in ``.laz``; under a temporary name until it is whole.
+    """Write LAS, LAZ where the name ends in ``.laz`` or COPC (``.copc.laz``); under a temporary name until it is whole.
 
     Parameters
     ----------
@@ -194,6 +195,8 @@ def _write_whole(data: Any, path: Path) -> None:
     try:
         with file.part.open("wb") as stream:
             data.write(stream, do_compress=path.suffix.lower() == ".laz")
+        if path.name.lower().endswith(SUFFIX):
+            write_copc(file.part, file.part)
         file.finish()
     except OSError as error:
         raise OutputError(
