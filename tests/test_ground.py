@@ -127,6 +127,28 @@ def test_height_is_continuous_and_ends_where_no_ground_is_near() -> None:
     assert np.isnan(model.height_at(np.array([[150.0, 30.0], [-40.0, 0.0], [1e6, 1e6]]))).all()
 
 
+def test_height_is_the_bilinear_mean_of_the_planes_around() -> None:
+    rng = np.random.default_rng(11)
+    height = np.where(rng.random((6, 5)) < 0.3, np.nan, rng.normal(size=(6, 5)))
+    model = GroundModel(
+        2.0, np.array([-3, 4]), height, rng.normal(size=(6, 5, 2)), height == height, True, np.eye(3)[2]
+    )
+    xy = rng.uniform([-9.0, 5.0], [9.0, 21.0], (500, 2))
+    expected = np.full(len(xy), np.nan)
+    for p, at in enumerate(xy):
+        total = weight = 0.0
+        for (i, j), level in np.ndenumerate(height):
+            centre = 2.0 * (model.first + (i, j) + 0.5)
+            w = np.prod(np.maximum(1.0 - np.abs(at - centre) / 2.0, 0.0))
+            if w > 0 and np.isfinite(level):
+                total += w * (level + model.slope[i, j] @ (at - centre))
+                weight += w
+        if weight > 0:
+            expected[p] = total / weight
+    assert 0.1 < np.isnan(expected).mean() < 0.9
+    np.testing.assert_allclose(model.height_at(xy), expected, rtol=0, atol=1e-12)
+
+
 def test_objects_cut_out_of_their_scene_have_no_ground() -> None:
     rng = np.random.default_rng(8)
     feet = [(4.0 * i, 5.0 * j) for i in range(6) for j in range(6)]
