@@ -113,7 +113,7 @@ def exchanged(threads: int) -> Exchange:
         neighbours.nearest: nearest,
         neighbours.count_neighbours: count_neighbours,
         clusters.linked: linked,
-        instances.dbscan: dbscan,
+        clusters.dbscan: dbscan,
         proxies.voxel_components: voxel_components,
     }
 
