@@ -88,19 +88,21 @@ class _Count(event.Listener):  # type: ignore[misc]
         self.compiled: set[str] = set()
         self._ours = {_name(kernel) for kernel in kernels()}
         self._progress = progress or (lambda done, total, text: None)
-        self._seconds: list[float] = []
+        self._begun: list[float] = []
+        self._in_callees = [0.0]
 
     def on_start(self, event: Any) -> None:
         """A kernel is to be compiled, maybe amid one that calls it."""
-        self._seconds.append(-time.thread_time())
+        self._begun.append(time.thread_time())
+        self._in_callees.append(0.0)
 
     def on_end(self, event: Any) -> None:
         """It is."""
-        seconds = self._seconds.pop() + time.thread_time()
-        if self._seconds:  # the caller's own time is what remains
-            self._seconds[-1] -= seconds
+        seconds = time.thread_time() - self._begun.pop()
+        own = seconds - self._in_callees.pop()
+        self._in_callees[-1] += seconds
         kernel = event.data["dispatcher"]
-        logger.debug("%5.2f s  %s(%s)", seconds, _name(kernel), ", ".join(map(str, event.data["args"])))
+        logger.debug("%5.2f s  %s(%s)", own, _name(kernel), ", ".join(map(str, event.data["args"])))
         if _name(kernel) in self._ours - self.compiled:
             self.compiled.add(_name(kernel))
             self._progress(len(self.compiled), len(self._ours), COMPILING)
