@@ -12,7 +12,13 @@ from click.testing import CliRunner
 from scipy.spatial import cKDTree
 
 from loda_pdal.benchmark.commands import bench
-from loda_pdal.benchmark.simulate import SimulatedBlock, SimulationOptions, simulate_block, write_block
+from loda_pdal.benchmark.simulate import (
+    SimulatedBlock,
+    SimulationOptions,
+    fused_block,
+    simulate_block,
+    write_block,
+)
 from loda_pdal.benchmark.simulate.block import EpochScene, epoch_scenes
 from loda_pdal.benchmark.simulate.edits import EditCounts, draw_edits
 from loda_pdal.benchmark.simulate.objects import Car, House
@@ -367,6 +373,20 @@ def test_trajectory_leads_along_the_street(block: SimulatedBlock) -> None:
     assert np.all(np.diff(block.surveys.after.gps_time) >= 0)
 
 
+def test_a_fused_block_has_one_mean_point_per_voxel(block: SimulatedBlock) -> None:
+    fused = fused_block(block, 0.5)
+    assert fused.truth.made_by["leaf_m"] == 0.5 and fused.truth.instances == block.truth.instances
+    for raw, survey in zip(block.surveys, fused.surveys, strict=True):
+        low = np.floor(raw.xyz.min(axis=0) / 1000) * 1000
+        of_raw = np.floor(np.round((raw.xyz - low) * 65536) / 65536 / 0.5).astype(int)
+        voxels, which = np.unique(of_raw, axis=0, return_inverse=True)
+        assert len(survey) == len(voxels)
+        for i in (0, len(voxels) // 2, len(voxels) - 1):
+            inside = np.flatnonzero(which == i)
+            assert np.allclose(survey.xyz[i], raw.xyz[inside].mean(axis=0), atol=1e-3)
+            assert survey.truth_id[i] == raw.truth_id[inside[0]] and survey.gps_time[i] == raw.gps_time[inside[0]]
+
+
 def test_a_foreign_truth_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "truth.json"
     path.write_text(json.dumps({"format": "something else"}))
@@ -384,3 +404,5 @@ def test_simulate_command(tmp_path: Path) -> None:
     summary = json.loads(result.output)
     assert summary["points"]["before"] == len(laspy.read(out / "before.laz"))
     assert Truth.read(out / "truth.json").made_by["seed"] == 5
+    result = CliRunner().invoke(bench, [*asked, "--overwrite", "--leaf", "0.25"])
+    assert json.loads(result.output)["points"]["before"] < summary["points"]["before"]

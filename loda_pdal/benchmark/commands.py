@@ -1,8 +1,9 @@
-"""`loda-pdal bench`: simulated street blocks with known truth, and scores of runs against it."""
+"""`loda-pdal bench`: simulated street blocks with known truth, scores of runs against it, and what runs cost."""
 
 from __future__ import annotations
 
 import json
+import tempfile
 from pathlib import Path
 
 import click
@@ -10,7 +11,7 @@ import click
 
 @click.group()
 def bench() -> None:
-    """Simulated scenes with known truth, and scores."""
+    """Simulated scenes with known truth, scores, and what a run costs."""
 
 
 @bench.command()
@@ -22,6 +23,9 @@ def bench() -> None:
 @click.option("--shift", type=float, default=0.05, show_default=True, help="Misregistration of the before epoch, m.")
 @click.option("--rotation", type=float, default=0.2, show_default=True, help="Its rotation, degrees.")
 @click.option("--noise", type=float, default=0.02, show_default=True, help="Range noise, m.")
+@click.option(
+    "--leaf", type=click.FloatRange(min=0.01), metavar="M", help="Write one mean point per voxel of this edge."
+)
 @click.option("--no-edits", is_flag=True, help="Survey an unchanged street twice.")
 @click.option("--overwrite", is_flag=True, help="Replace files that are there already.")
 @click.option("--json", "as_json", is_flag=True, help="Write the summary as JSON.")
@@ -34,12 +38,13 @@ def simulate(
     shift: float,
     rotation: float,
     noise: float,
+    leaf: float | None,
     no_edits: bool,
     overwrite: bool,
     as_json: bool,
 ) -> None:
     """Make a street block, survey it twice, and write before.laz, after.laz and truth.json to OUT."""
-    from loda_pdal.benchmark.simulate import SimulationOptions, simulate_block, write_block
+    from loda_pdal.benchmark.simulate import SimulationOptions, fused_block, simulate_block, write_block
 
     options = SimulationOptions(
         length_m=length,
@@ -51,6 +56,8 @@ def simulate(
         has_edits=not no_edits,
     )
     block = simulate_block(seed, options)
+    if leaf is not None:
+        block = fused_block(block, leaf)
     paths = write_block(block, out, overwrite=overwrite)
     if as_json:
         summary = {
@@ -92,6 +99,7 @@ def calibrate(first: int, last: int, preset: str) -> None:
     from loda_pdal.benchmark.calibrate import fit, judge_blocks
     from loda_pdal.params import Parameters
 
+    _compile_kernels()
     found = fit(list(judge_blocks(range(first, last + 1), Parameters.preset(preset))))
     for name, (offset, slope) in found.values.items():
         click.echo(f"confidence.{name} = [{offset}, {slope}]")
@@ -108,6 +116,7 @@ def coverage(seeds: tuple[int, ...], preset: str) -> None:
     from loda_pdal.benchmark.metrics import markdown_table
     from loda_pdal.params import Parameters
 
+    _compile_kernels()
     rows = []
     for seed in seeds:
         found = coverage_of(unchanged_grid(seed, Parameters.preset(preset)))
@@ -120,3 +129,52 @@ def coverage(seeds: tuple[int, ...], preset: str) -> None:
             ]
         )
     click.echo(markdown_table(["seed", "cells", "all, %", "level", "upright", "slanted", "median LoD95, m"], rows))
+
+
+@bench.command()
+@click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
+@click.option(
+    "--points",
+    "sizes",
+    type=click.FloatRange(0.05, 4.0),
+    multiple=True,
+    default=(0.4, 0.8, 1.6, 2.4, 3.2),
+    show_default=True,
+    help="Million fused points of both epochs together; once for each block.",
+)
+@click.option("--repeats", type=click.IntRange(1), default=3, show_default=True, help="Runs per block; medians count.")
+@click.option("--seed", type=click.IntRange(0), default=40, show_default=True, help="Of the simulated street.")
+@click.option("--threads", type=click.IntRange(1), help="Threads to use; all processors if left out.")
+@click.option("--preset", default="street", show_default=True, help="Parameters of the runs.")
+@click.option("--json", "as_json", is_flag=True, help="Write everything as JSON.")
+def profile(
+    folder: Path, sizes: tuple[float, ...], repeats: int, seed: int, threads: int | None, preset: str, as_json: bool
+) -> None:
+    """Time and memory of `detect` by the size of the block: the paper's efficiency table, for this machine.
+
+    Blocks are streets of growing length, simulated into FOLDER unless they are there, one point per 0.25 m voxel.
+    Every run is a process of its own, from LAZ to all outputs. Leaves profile.json and profile.md in FOLDER.
+    """
+    from loda_pdal.benchmark.profile import profile_detect
+
+    _compile_kernels()
+    found = profile_detect(
+        folder,
+        sorted(sizes),
+        repeats=repeats,
+        seed=seed,
+        options=["--preset", preset, *(["--threads", str(threads)] if threads else [])],
+        say=lambda text: click.echo(text, err=True),
+    )
+    click.echo(json.dumps(found.to_dict(), indent=2) if as_json else found.to_markdown())
+
+
+def _compile_kernels() -> None:
+    """Compile the kernels, and say so, where that has not been done."""
+    from loda_pdal.kernels import is_cache_warm
+    from loda_pdal.warmup import compile_kernels
+
+    if not is_cache_warm():
+        click.echo("Compiling kernels, once: that takes about half a minute.", err=True)
+        with tempfile.TemporaryDirectory(prefix="loda-pdal-") as scratch:
+            compile_kernels(Path(scratch))

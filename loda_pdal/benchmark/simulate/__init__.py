@@ -6,7 +6,13 @@ puts both surveys and the truth together, ``writer`` makes files of them.
 
 from __future__ import annotations
 
-from loda_pdal.benchmark.simulate.block import SimulatedBlock, SimulatedSurvey, SimulationOptions, simulate_block
+from loda_pdal.benchmark.simulate.block import (
+    SimulatedBlock,
+    SimulatedSurvey,
+    SimulationOptions,
+    fused_block,
+    simulate_block,
+)
 from loda_pdal.benchmark.simulate.writer import write_block
 
-__all__ = ["SimulatedBlock", "SimulatedSurvey", "SimulationOptions", "simulate_block", "write_block"]
+__all__ = ["SimulatedBlock", "SimulatedSurvey", "SimulationOptions", "fused_block", "simulate_block", "write_block"]

@@ -16,9 +16,12 @@ from loda_pdal.benchmark.simulate.shapes import EMPTY, Shape, joined
 from loda_pdal.benchmark.truth import Truth, TruthInstance
 from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, Int64Array
 from loda_pdal.model.errors import ParameterError
+from loda_pdal.model.frame import LocalFrame
 from loda_pdal.model.labels import ChangeLabel, ObjectClass
 from loda_pdal.model.pair import Pair
 from loda_pdal.model.transform import invert, transform_points
+from loda_pdal.params import FuseParams
+from loda_pdal.stages.fuse import fuse_points
 
 CRS = "EPSG:7415"
 """Amersfoort / RD New with NAP heights: the simulated streets lie in the Netherlands."""
@@ -188,6 +191,28 @@ def simulate_block(seed: int, options: SimulationOptions | None = None) -> Simul
         },
     )
     return SimulatedBlock(surveys, truth, seed, options)
+
+
+def fused_block(block: SimulatedBlock, leaf_m: float) -> SimulatedBlock:
+    """The block as a fused map: one point per voxel of ``leaf_m`` (m), the mean of its returns; all else is that of the
+    first of them. The truth stays that of the returns."""
+
+    def fused(survey: SimulatedSurvey) -> SimulatedSurvey:
+        low = np.floor(survey.xyz.min(axis=0, initial=np.inf) / 1000.0) * 1000.0 if len(survey) else np.zeros(3)
+        frame = LocalFrame((int(low[0]), int(low[1]), 0))
+        cloud = fuse_points(frame.to_local(survey.xyz), FuseParams(leaf_m=leaf_m))
+        first = np.unique(cloud.voxel_idx, return_index=True)[1]
+        return SimulatedSurvey(
+            np.round(frame.to_map(cloud.xyz) / COORDINATE_STEP_M) * COORDINATE_STEP_M,
+            survey.truth_id[first],
+            survey.truth_change[first],
+            survey.gps_time[first],
+            survey.intensity[first],
+            survey.trajectory,
+        )
+
+    made_by = {**block.truth.made_by, "leaf_m": leaf_m}
+    return replace(block, surveys=block.surveys.map(fused), truth=replace(block.truth, made_by=made_by))
 
 
 def _stream(seed: int, purpose: int) -> np.random.Generator:
