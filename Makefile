@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help demo test check venv pdal clean
+.PHONY: help demo test check venv pdal qgis plugin clean
 
 BIN := .venv/bin
 
@@ -12,10 +12,12 @@ demo: venv  ## simulate two surveys, detect the changes, score them against the 
 	@$(BIN)/loda-pdal bench score demo/result demo/input/truth.json
 	@printf '\nlayers for QGIS: demo/result/changes.gpkg\npoint cloud:     demo/result/changes.laz\nreport:          demo/result/report.html\n'
 
-test: venv  ## formatting, lint, types and all tests; with PDAL where it can be had
+test: venv  ## formatting, lint, types and all tests; with PDAL and QGIS where they can be had
 	@scripts/install_pdal.sh --if-possible
+	@scripts/install_qgis.sh --if-possible
 	@$(MAKE) --no-print-directory check
 	@$(BIN)/python -m pytest
+	@if [ -x .qgis/bin/python ]; then .qgis/bin/python -m pytest -c tests/qgis/pytest.ini tests/qgis; fi
 
 check: venv  ## formatting, lint and types
 	$(BIN)/ruff format --check .
@@ -25,9 +27,15 @@ check: venv  ## formatting, lint and types
 pdal: venv  ## a private PDAL with its Python plugin in .pdal (Debian 12, root)
 	@scripts/install_pdal.sh
 
-clean:  ## remove everything that make has made, except .venv and .pdal
+qgis: venv  ## QGIS from bookworm-backports and the environment of its tests (Debian 12, root)
+	@scripts/install_qgis.sh
+
+plugin: venv  ## the QGIS plugin as a zip in dist, with the parameters of this engine
+	@$(BIN)/python qgis_plugin/package.py
+
+clean:  ## remove everything that make has made, except .venv, .pdal and .qgis
 	rm -rf demo build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis
-	find . -name __pycache__ -not -path './.venv/*' -prune -exec rm -rf {} +
+	find . -name __pycache__ -not -path './.venv/*' -not -path './.qgis/*' -prune -exec rm -rf {} +
 
 venv:
 	@scripts/setup_venv.sh

@@ -14,6 +14,8 @@ ROOT = Path(__file__).resolve().parent.parent
 IN_CI = os.environ.get("CI", "").lower() in ("1", "true")
 NO_PDAL = "no pdal program whose filters.python can import loda_pdal (make pdal, or docs/pdal.md)"
 
+collect_ignore = ["qgis"]  # those run in QGIS's own Python, see tests/qgis/conftest.py
+
 settings.register_profile("loda", deadline=None, derandomize=True, max_examples=25, database=None)
 settings.load_profile("loda")
 

@@ -99,7 +99,7 @@ def review_elements() -> str:
 def _labelling() -> str:
     return (
         f'<labeling type="simple"><settings><text-style fieldName={quoteattr(_LABEL)} isExpression="1" fontSize="8" '
-        'fontSizeUnit="Point" textColor="30,30,30,255" multilineHeight="1"><text-buffer bufferDraw="1" '
+        'fontSizeUnit="Point" fontWeight="75" textColor="20,20,20,255" multilineHeight="1"><text-buffer bufferDraw="1" '
         'bufferSize="0.8" bufferSizeUnits="MM" bufferColor="255,255,255,230"/></text-style>'
         '<placement placement="1" centroidWhole="1" polygonPlacementFlags="2"/>'
         f'<rendering drawLabels="1" scaleVisibility="1" scaleMin="0" scaleMax="{LABELS_FROM_SCALE}" obstacle="1"/>'

@@ -18,6 +18,7 @@ from qgis.core import (
     QgsSingleBandPseudoColorRenderer,
     QgsVectorLayer,
 )
+from qgis.PyQt import sip
 from qgis.PyQt.QtGui import QColor
 
 from .legend import CHANGE_CLASSES, LOD_CLASSES
@@ -47,6 +48,16 @@ class _Styler(QgsProcessingLayerPostProcessorInterface):
         style(layer)
 
 
+_stylers = []
+
+
+def _new_styler():
+    """A styler for one layer: the context deletes it in the end, and Python must not do so before."""
+    _stylers[:] = [styler for styler in _stylers if not sip.isdeleted(styler)]
+    _stylers.append(_Styler())
+    return _stylers[-1]
+
+
 def load_later(folder, context):
     """Have the layers of a result folder added to the map when the algorithm is over."""
     folder = Path(folder)
@@ -59,7 +70,7 @@ def load_later(folder, context):
         details = QgsProcessingContext.LayerDetails(name, context.project(), name, _hint(source))
         details.groupName = f"Changes in {folder.name}"
         details.layerSortKey = place
-        details.setPostProcessor(_Styler())  # the context deletes it: one for each layer
+        details.setPostProcessor(_new_styler())
         context.addLayerToLoadOnCompletion(uri, details)
 
 
@@ -81,6 +92,7 @@ def style(layer):
     """Colours, legend and map tip of a layer of ours."""
     source = Path(layer.source().partition("|")[0]).name
     if isinstance(layer, QgsVectorLayer):
+        layer.loadDefaultStyle()  # from the GeoPackage; Processing loads layers without
         if layer.source().endswith("layername=changes") and PICTURE_IN_TIP not in layer.mapTipTemplate():
             layer.setMapTipTemplate(layer.mapTipTemplate() + PICTURE_IN_TIP)
     elif source == "lod95.tif":

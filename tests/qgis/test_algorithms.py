@@ -10,8 +10,9 @@ import time
 from pathlib import Path
 
 import pytest
-from conftest import PLUGINS, Listening
 from qgis.core import QgsPointCloudLayer, QgsProcessingAlgorithm, QgsProcessingException, QgsRasterLayer, QgsVectorLayer
+
+from conftest import PLUGINS, Listening
 
 ALGORITHMS = {
     "detectchanges",

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
-from conftest import Listening
 from qgis.core import (
     QgsExpression,
     QgsExpressionContext,
@@ -24,6 +24,8 @@ from qgis.core import (
 from qgis.gui import QgsMapCanvas
 from qgis.PyQt.QtCore import QSize
 from qgis.PyQt.QtGui import QColor
+
+from conftest import Listening
 
 COLOURS = {"Added": "#0072b2", "Removed": "#d55e00", "Increased": "#56b4e9", "Decreased": "#e69f00"}
 
@@ -99,7 +101,7 @@ def test_labels_appear_on_zoom(changes):
     with_labels = pixels(rendered([changes], box))
     changes.setLabelsEnabled(False)
     without = pixels(rendered([changes], box))
-    dark = number("#1e1e1e")
+    dark = number("#141414")
     assert nearest(with_labels, dark, 40) > nearest(without, dark, 40) + 50
     assert changes.labeling().settings().scaleVisibility and changes.labeling().settings().minimumScale == 1500
 
@@ -151,6 +153,7 @@ def test_all_layers_load_named_grouped_and_styled(run, surveys, folder, project,
         "Points by change",
         "Limit of detection (LoD95)",
     }
+    gc.collect()  # the stylers must outlive the algorithm
     layers = {}
     for uri, details in waiting.items():
         layer = QgsProcessingUtils.mapLayerFromString(uri, context, True, details.layerTypeHint)
@@ -166,6 +169,8 @@ def test_all_layers_load_named_grouped_and_styled(run, surveys, folder, project,
     assert "confirmed (" in (folder / "report.html").read_text()
     assert found["CHANGED"] > 5
 
+    assert layers["Changes"].renderer().classAttribute() == "label" and layers["Changes"].labelsEnabled()
+    assert layers["Ground changes"].renderer().classAttribute() == "label"
     raster = layers["Limit of detection (LoD95)"]
     assert isinstance(raster, QgsRasterLayer)
     legend = [item.label for item in raster.renderer().shader().rasterShaderFunction().colorRampItemList()]
