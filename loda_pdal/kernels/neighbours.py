@@ -5,6 +5,7 @@ Ties go to the lower index, so results depend neither on the cell size nor on th
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,16 +28,22 @@ from loda_pdal.kernels.blocks import (
 from loda_pdal.kernels.cells import (
     CellList,
     Float32Array,
+    FloatArray,
     Int64Array,
     IntArray,
     block_edge,
     build_cells,
     cells_between,
+    empty_runs,
     first_above,
     first_column,
+    middle_of,
+    runs_within,
     sq_distance,
     sq_gap_to_column,
+    to_cell_frame,
 )
+from loda_pdal.kernels.parallel import run_ranges
 
 
 class NeighbourTable(NamedTuple):
@@ -234,3 +241,5 @@ def k_within(cells, x, y, z, radius, skip, best_sq, best_idx):  # type: ignore[n
                     p += 1
             c += 1
     return n_found
+
+
