@@ -175,8 +175,6 @@ def _moved(
     nodes: Regions, labels: IntArray, regions: Regions, features: Float32Array, *, opens_regions: bool
 ) -> Regions:
     """Connected regions after moving ``nodes``, of which ``labels`` says in which of the ``regions`` they are."""
-    medians = np.empty((len(nodes), N_FEATURES), dtype=np.float32)
-    medians[: len(regions)] = regions.medians
     move_nodes(
         *nodes.graph,
         features,
@@ -185,7 +183,7 @@ def _moved(
         nodes.medians,
         nodes.deviations,
         labels,
-        medians,
+        np.pad(regions.medians, ((0, len(nodes) - len(regions)), (0, 0))),
         len(regions),
         _SWEEPS,
         opens_regions,
