@@ -10,8 +10,17 @@ import numpy as np
 import pytest
 
 import loda_pdal.kernels
-from loda_pdal.kernels import neighbours, parallel
-from loda_pdal.kernels.neighbours import build_cells, knn, middle_of, nearest, radius_neighbours
+from loda_pdal.kernels import cells, neighbours, parallel
+from loda_pdal.kernels.blocks import MOST_IN_BLOCK
+from loda_pdal.kernels.cells import CellList, build_cells, extent, middle_of, to_cell_frame
+from loda_pdal.kernels.neighbours import (
+    count_neighbours,
+    k_nearest,
+    knn,
+    mean_distances,
+    nearest,
+    radius_neighbours,
+)
 from loda_pdal.kernels.parallel import run_ranges, set_threads, thread_count
 
 
@@ -43,6 +52,39 @@ def slow_knn(sq: np.ndarray, k: int, max_distance: float, skips_self: bool) -> t
     return idx, distance
 
 
+def slow_cells(xyz: np.ndarray, cell_m: float) -> CellList:
+    """A cell list from its definition."""
+    centre = middle_of(xyz)
+    local = (xyz - centre).astype(np.float32)
+    low, high = local.min(axis=0).astype(np.float64), local.max(axis=0).astype(np.float64)
+    x, y = np.floor((local[:, :2] - low[:2]) / cell_m).astype(int).T
+    order = np.lexsort((local[:, 2], y, x))
+    columns, column_start = np.unique(np.column_stack([x, y])[order], axis=0, return_index=True)
+    row_start = np.searchsorted(columns[:, 0], np.arange(x.max() + 2))
+    column_start = np.append(column_start, len(xyz))
+    return CellList(local[order], order, row_start, columns[:, 1], column_start, low, high, cell_m, centre)
+
+
+@pytest.mark.parametrize("cell_m", [0.1, 0.7, 3.0, 1000.0])
+def test_cell_list_equals_its_definition(cell_m: float) -> None:
+    xyz = cloud(5, 3000) - [390_000.0, 6_460_000.0, 20.0]
+    xyz[:2] = [[-400.0] * 3, [400.0] * 3]
+    xyz[200:260, 2] = np.where(np.arange(60) % 2, 0.0, -0.0)  # zeros of both signs are a tie
+    found = build_cells(xyz, cell_m)
+    for field, expected in slow_cells(xyz, cell_m)._asdict().items():
+        assert np.array_equal(getattr(found, field), expected), field
+    assert {found.idx.dtype, found.row_start.dtype, found.column_y.dtype, found.column_start.dtype} == {np.dtype("i4")}
+
+
+def test_extent_and_middle() -> None:
+    xyz = np.array([[1.0, -2.0, 3.0], [4.0, 0.5, -6.5]], dtype=np.float32)
+    low, high = extent(xyz)
+    assert (low.tolist(), high.tolist()) == ([1.0, -2.0, -6.5], [4.0, 0.5, 3.0])
+    assert low.dtype == high.dtype == np.float64
+    assert middle_of(xyz).tolist() == [2.0, -1.0, -2.0]
+    assert middle_of(np.zeros((0, 3))).tolist() == [0.0, 0.0, 0.0]
+
+
 @pytest.mark.parametrize(
     ("k", "max_distance", "includes_self"),
     [(1, np.inf, True), (5, np.inf, False), (20, 1.5, True), (20, 1.0, False), (500, np.inf, True)],
@@ -53,6 +95,34 @@ def test_knn_equals_brute_force(k: int, max_distance: float, includes_self: bool
     idx, distance = slow_knn(sq_distances(xyz, xyz), k, max_distance, not includes_self)
     assert np.array_equal(found.idx, idx)
     assert np.allclose(found.distance, distance, rtol=1e-6)
+
+
+@pytest.mark.parametrize("includes_self", [True, False])
+def test_knn_in_a_crowd_and_far_from_it(includes_self: bool) -> None:
+    rng = np.random.default_rng(3)
+    crowd = rng.normal(0, 0.1, (3000, 3))
+    crowd[: MOST_IN_BLOCK + 90] = 0.05  # more in one place than a block holds
+    xyz = np.vstack([crowd, rng.uniform(20, 90, (20, 3))])
+    found = knn(xyz, 6, includes_self=includes_self)
+    idx, _ = slow_knn(sq_distances(xyz, xyz), 6, np.inf, not includes_self)
+    assert np.array_equal(found.idx, idx)
+
+
+def test_one_query_at_a_time_finds_the_same() -> None:
+    xyz = cloud(4)
+    found, asked = knn(xyz, 5, 2.0), build_cells(xyz, 0.8)
+    best_sq, best_idx, guess = np.empty(5), np.empty(5, dtype=np.int32), asked.cell_m
+    for i, (x, y, z) in enumerate(to_cell_frame(asked, xyz)[::9]):
+        n, guess = k_nearest(asked, x, y, z, guess, 2.0, -1, best_sq, best_idx)
+        assert best_idx[:n].tolist() == [j for j in found.idx[9 * i] if j >= 0]
+        assert np.sqrt(best_sq[:n]) == pytest.approx(found.distance[9 * i, :n], rel=1e-6)
+
+
+@pytest.mark.parametrize("k", [1, 9, 399])
+def test_mean_distances_equal_their_definition(k: int) -> None:
+    xyz = cloud()
+    _, distance = slow_knn(sq_distances(xyz, xyz), k, np.inf, True)
+    assert mean_distances(xyz, k) == pytest.approx(distance.mean(axis=1), rel=1e-6)
 
 
 def test_knn_of_other_queries_equals_brute_force() -> None:
@@ -76,22 +146,23 @@ def test_radius_neighbours_equal_brute_force(radius: float) -> None:
     sq = sq_distances(xyz, xyz)
     for q in range(len(xyz)):
         assert sorted(found.idx[found.starts[q] : found.starts[q + 1]]) == np.flatnonzero(sq[q] <= radius**2).tolist()
+    assert count_neighbours(xyz, radius).tolist() == (sq <= radius**2).sum(axis=1).tolist()
 
 
 def test_cell_size_does_not_change_the_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     xyz = cloud()
     expected = knn(xyz, 6)
     for cell_m in (0.05, 0.4, 30.0):
-        monkeypatch.setattr(neighbours, "_cell_for", lambda _xyz, _k, cell_m=cell_m: cell_m)
+        monkeypatch.setattr(neighbours, "block_edge", lambda _xyz, _k, cell_m=cell_m: cell_m)
         found = knn(xyz, 6)
         assert np.array_equal(found.idx, expected.idx)
 
 
 def test_memory_follows_the_points_and_not_the_extent() -> None:
     xyz = np.array([[0.0, 0, 0], [2e5, 0, 0], [2e5, 3e5, 0.0], [0.1, 0, 0]])
-    cells = build_cells(xyz, 0.25)
-    assert cells.row_start.size <= 2 * neighbours.MOST_CELLS_ALONG
-    assert cells.column_y.size <= 4
+    found = build_cells(xyz, 0.25)
+    assert found.row_start.size <= 2 * cells.MOST_CELLS_ALONG
+    assert found.column_y.size <= 4
     assert nearest(xyz, xyz + np.array([0.0, 0.2, 0]), 1.0)[0].tolist() == [0, 1, 2, 3]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from loda_pdal.kernels.planes import mad_sigma
 from loda_pdal.params import NormalParams
 from loda_pdal.stages.normals import estimate_normals
 
@@ -53,6 +54,15 @@ def test_equals_a_slow_twin() -> None:
             mad = 1.4826 * np.median(np.abs(residual - np.median(residual)))
             assert abs(found.normals[i] @ vectors[:, 0]) > 1 - 1e-5
             assert found.roughness[i] == pytest.approx(mad, abs=2e-5)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 6, 7, 30, 101])
+def test_mad_equals_its_definition(n: int) -> None:
+    for seed in range(20):
+        values = np.random.default_rng(seed).normal(0, 1, n)
+        values[: n // 3] = values[0]
+        expected = 1.4826 * np.median(np.abs(values - np.median(values)))
+        assert mad_sigma(values, n, np.empty(n), np.empty(n, dtype=np.int32)) == pytest.approx(expected, abs=1e-15)
 
 
 def test_wires_blobs_and_lone_points_are_no_planes() -> None:

@@ -1,23 +1,23 @@
-"""Many queries at once: those close together share one copy of the points around them.
+"""Many queries at once: those that are close together share one copy of the points around them.
 
-Queries are a cell list too, often that of the cloud itself; a block is a piece of one of its columns. The points around
-a block are copied once, coordinate by coordinate, so that each query then runs over a few short arrays. A kernel of
-your own that visits all points within a radius reads::
+Queries are a cell list too, often that of the cloud itself. A block is a piece of one of its columns, as high as it is
+wide; the points around it are copied once, coordinate by coordinate, and each query runs over these short arrays. A
+kernel of your own that visits all points within a radius reads::
 
     @njit(nogil=True, cache=True)
-    def _count_range(start, stop, cells, queries, radius, counts):
-        near = no_surroundings()
-        for column in range(start, stop):
-            q, column_stop = queries.column_start[column], queries.column_start[column + 1]
-            while q < column_stop:
-                block_stop = end_of_block(queries, q, column_stop)
-                near, n = around(cells, queries, q, block_stop, radius, near)
-                for q in range(q, block_stop):
-                    for h in range(within(near, n, queries.xyz[q], radius * radius)):
-                        counts[queries.idx[q]] += 1         # near.idx[near.hit[h]] is the point's index
-                q = block_stop
+    def _count_range(start, stop, room, blocks, queries, cells, radius, counts):
+        for block in range(start, stop):
+            n = around(room, cells, box_of(queries, blocks[block], blocks[block + 1]), radius)
+            if n < 0:
+                return block
+            for q in range(blocks[block], blocks[block + 1]):
+                measure(room, n, queries.xyz[q, 0], queries.xyz[q, 1], queries.xyz[q, 2])
+                counts[queries.idx[q]] = hits_within(room, n, radius * radius)
+                # room.idx[room.hit[h]] is the index of a point within the radius
+        return stop
 
-    run_ranges(_count_range, len(queries.column_y), cells, queries, radius, counts, min_size=COLUMNS_PER_RANGE)
+    cells = build_cells(xyz, max(radius, block_edge(xyz)))
+    run_blocks(_count_range, cells, cells, radius, counts)
 """
 
 from __future__ import annotations
@@ -29,34 +29,40 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from loda_pdal.kernels.cells import CellList, cells_between, first_above, first_column
+from loda_pdal.kernels.cells import CellList, cells_between, extent, first_above, first_column
 from loda_pdal.kernels.parallel import run_ranges
+
+POINTS_PER_COLUMN = 24
+"""Points per column, on average, at which blocks are quickest."""
 
 MOST_IN_BLOCK = 256
 """Queries in a block."""
 
-COLUMNS_PER_RANGE = 64
-"""Columns of queries worth a thread."""
+BLOCKS_PER_RANGE = 64
+"""Blocks worth a thread."""
 
 
-def run_columns(function: Callable[..., Any], queries: CellList, *args: Any) -> None:
-    """Call ``function(start, stop, queries, *args)`` for ranges that cover the columns of ``queries`` once."""
-    run_ranges(function, len(queries.column_y), queries, *args, min_size=COLUMNS_PER_RANGE)
-
-
-class Surroundings(NamedTuple):
-    """The points around a block, by column and height, and room for what a query finds among them.
+class Room(NamedTuple):
+    """The points around a block, by column and height, and what its queries find among them.
 
     Attributes
     ----------
     x, y, z : (m,) float32, m
-        Their coordinates about the centre of the cell list; only the first n of each array mean anything.
+        Coordinates about the centre of the cell list; of these and what follows the first n mean something.
     idx : (m,) int32
-        Their indices in the cloud.
+        Indices in the cloud.
     sq : (m,) float64, m2
         Squared distances from the last query.
-    hit, order : (m + 1,) int32
-        Which of them the last query found; and these almost by distance.
+    hit : (m + 1,) int32
+        Which of the points the last query found within a radius.
+    nearest_sq : (b, k) float64, m2
+        Squared distances of the nearest points of each query of the block, in order.
+    nearest_idx : (b, k) int32
+        Their indices in the cloud; the lower of equally near ones comes first.
+    n_nearest : (b,) int32
+        How many there are.
+    order, ring, best_sq, best_idx
+        Room to sort.
     """
 
     x: npt.NDArray[np.float32]
@@ -65,43 +71,94 @@ class Surroundings(NamedTuple):
     idx: npt.NDArray[np.int32]
     sq: npt.NDArray[np.float64]
     hit: npt.NDArray[np.int32]
+    nearest_sq: npt.NDArray[np.float64]
+    nearest_idx: npt.NDArray[np.int32]
+    n_nearest: npt.NDArray[np.int32]
     order: npt.NDArray[np.int32]
+    ring: npt.NDArray[np.int32]
+    best_sq: npt.NDArray[np.float64]
+    best_idx: npt.NDArray[np.int32]
+
+
+def run_blocks(kernel: Callable[..., int], queries: CellList, *args: Any, k: int = 0) -> None:
+    """Call ``kernel(start, stop, room, blocks, queries, *args)`` for ranges that cover the blocks of queries once.
+
+    Block b is the sorted queries ``blocks[b]`` to ``blocks[b + 1]``. A kernel returns the block that it reached: it is
+    called again from there, with twice the room, if that is not ``stop`` because there were too many points around.
+    ``k`` is how many nearest points of each query there is room for.
+    """
+    starts = np.empty(len(queries.xyz) + 1, dtype=np.int64)
+    n_blocks = _find_blocks(queries.xyz, queries.column_start, queries.cell_m, starts)
+    blocks = starts[: n_blocks + 1].copy()
+
+    def run(start: int, stop: int) -> None:
+        m = 1024
+        while start < stop:
+            start = kernel(start, stop, _room_for(m, k), blocks, queries, *args)
+            m *= 2
+
+    run_ranges(run, n_blocks, min_size=BLOCKS_PER_RANGE)
+
+
+def block_edge(xyz: npt.NDArray[Any], k: int = 1) -> float:
+    """Column edge (m) that leaves `POINTS_PER_COLUMN`, or k, to each occupied column: a matter of speed only."""
+    low, high = extent(xyz[:, :2])
+    edge = max(float((high - low).max()) / 512, 1e-3)
+    is_occupied = np.zeros((514, 514), dtype=np.bool_)
+    is_occupied[tuple(((xyz[:, axis] - low[axis]) / edge).astype(np.int32) for axis in range(2))] = True
+    density = max(len(xyz), 1) / max(int(np.count_nonzero(is_occupied)), 1)
+    return edge * float(np.clip(np.sqrt(max(k, POINTS_PER_COLUMN) / density), 0.02, 20.0))
+
+
+def _room_for(m: int, k: int) -> Room:
+    whole, real, single = np.int32, np.float64, np.float32
+    return Room(
+        x=np.empty(m, single),
+        y=np.empty(m, single),
+        z=np.empty(m, single),
+        idx=np.empty(m, whole),
+        sq=np.empty(m, real),
+        hit=np.empty(m + 1, whole),
+        nearest_sq=np.empty((MOST_IN_BLOCK, k), real),
+        nearest_idx=np.empty((MOST_IN_BLOCK, k), whole),
+        n_nearest=np.empty(MOST_IN_BLOCK, whole),
+        order=np.empty(m, whole),
+        ring=np.empty(2 * k + 24, whole),
+        best_sq=np.empty(k, real),
+        best_idx=np.empty(k, whole),
+    )
 
 
 @njit(nogil=True, cache=True)
-def room_for(m):  # type: ignore[no-untyped-def]
-    """Surroundings with room for ``m`` points."""
-    xyz, whole, sq = np.empty((3, m), dtype=np.float32), np.empty((3, m + 1), dtype=np.int32), np.empty(m)
-    return Surroundings(xyz[0], xyz[1], xyz[2], whole[0], sq, whole[1], whole[2])
-
-
-@njit(nogil=True, cache=True)
-def end_of_block(queries, q, column_stop):  # type: ignore[no-untyped-def]
-    """End of the block that begins at sorted query ``q``: as high as its column is wide."""
-    top = queries.xyz[q, 2] + queries.cell_m
-    stop = min(column_stop, q + MOST_IN_BLOCK)
-    while q < stop and queries.xyz[q, 2] <= top:
-        q += 1
-    return q
+def _find_blocks(xyz, column_start, height, starts):  # type: ignore[no-untyped-def]
+    """Fill the first point of each block, and the number of points at the end; how many blocks."""
+    n_blocks = first = 0
+    for column in range(len(column_start) - 1):
+        for p in range(column_start[column], column_start[column + 1]):
+            if p == column_start[column] or xyz[p, 2] > xyz[first, 2] + height or p - first == MOST_IN_BLOCK:
+                first = starts[n_blocks] = p
+                n_blocks += 1
+    starts[n_blocks] = len(xyz)
+    return n_blocks
 
 
 @njit(nogil=True, cache=True)
 def box_of(queries, start, stop):  # type: ignore[no-untyped-def]
-    """Box around sorted queries [start, stop) of a column: x from, x to, y from, y to, z from, z to."""
-    x0 = x1 = queries.xyz[start, 0]
-    y0 = y1 = queries.xyz[start, 1]
+    """Box around sorted queries [start, stop) of a block: x from, x to, y from, y to, z from, z to."""
+    x0 = x1 = np.float64(queries.xyz[start, 0])
+    y0 = y1 = np.float64(queries.xyz[start, 1])
     for q in range(start + 1, stop):
-        x0, x1 = min(x0, queries.xyz[q, 0]), max(x1, queries.xyz[q, 0])
-        y0, y1 = min(y0, queries.xyz[q, 1]), max(y1, queries.xyz[q, 1])
-    z0, z1 = queries.xyz[start, 2], queries.xyz[stop - 1, 2]
-    return np.float64(x0), np.float64(x1), np.float64(y0), np.float64(y1), np.float64(z0), np.float64(z1)
+        x, y = np.float64(queries.xyz[q, 0]), np.float64(queries.xyz[q, 1])
+        x0, x1, y0, y1 = min(x0, x), max(x1, x), min(y0, y), max(y1, y)
+    return x0, x1, y0, y1, np.float64(queries.xyz[start, 2]), np.float64(queries.xyz[stop - 1, 2])
 
 
 @njit(nogil=True, cache=True)
-def around(cells, box, radius, near):  # type: ignore[no-untyped-def]
-    """Copy all points within ``radius`` of a box, and a few more; how many, or more than there is room for."""
+def around(room, cells, box, radius):  # type: ignore[no-untyped-def]
+    """Copy all points within ``radius`` of a box, and a few more; how many, -1 if there is not enough room."""
     x0, x1, y0, y1, z0, z1 = box
-    reach = radius * (1 + 1e-6) + 1e-6 * cells.cell_m
+    hair = 1e-6 * cells.cell_m
+    reach = radius * (1 + 1e-6) + hair
     n = 0
     first_row, last_row = cells_between(x0 - reach - cells.low[0], x1 + reach - cells.low[0], cells.cell_m)
     first_y, last_y = cells_between(y0 - reach - cells.low[1], y1 + reach - cells.low[1], cells.cell_m)
@@ -114,13 +171,14 @@ def around(cells, box, radius, near):  # type: ignore[no-untyped-def]
             dy = max(south - y1, y0 - south - cells.cell_m, 0.0)
             sq_up = reach * reach - dx * dx - dy * dy
             if sq_up > 0.0:
-                up = np.sqrt(sq_up) + 1e-6 * cells.cell_m
+                up = np.sqrt(sq_up) + hair
                 p, stop = cells.column_start[column], cells.column_start[column + 1]
                 p = first_above(cells.xyz, p, stop, z0 - up, False)
                 while p < stop and cells.xyz[p, 2] <= z1 + up:
-                    if n < len(near.sq):
-                        near.x[n], near.y[n], near.z[n] = cells.xyz[p, 0], cells.xyz[p, 1], cells.xyz[p, 2]
-                        near.idx[n] = cells.idx[p]
+                    if n == len(room.sq):
+                        return -1
+                    room.x[n], room.y[n], room.z[n] = cells.xyz[p, 0], cells.xyz[p, 1], cells.xyz[p, 2]
+                    room.idx[n] = cells.idx[p]
                     n += 1
                     p += 1
             column += 1
@@ -128,102 +186,65 @@ def around(cells, box, radius, near):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def measure(near, n, x, y, z):  # type: ignore[no-untyped-def]
+def measure(room, n, x, y, z):  # type: ignore[no-untyped-def]
     """Fill the squared distances of the first ``n`` points from (x, y, z), float64."""
     x, y, z = np.float64(x), np.float64(y), np.float64(z)
     for j in range(n):
-        dx, dy, dz = np.float64(near.x[j]) - x, np.float64(near.y[j]) - y, np.float64(near.z[j]) - z
-        near.sq[j] = dx * dx + dy * dy + dz * dz
+        dx, dy, dz = np.float64(room.x[j]) - x, np.float64(room.y[j]) - y, np.float64(room.z[j]) - z
+        room.sq[j] = dx * dx + dy * dy + dz * dz
 
 
 @njit(nogil=True, cache=True)
-def hits_within(near, n, sq_radius):  # type: ignore[no-untyped-def]
-    """Fill ``near.hit`` with those of the first ``n`` points whose measured distance is within; how many."""
+def hits_within(room, n, sq_radius):  # type: ignore[no-untyped-def]
+    """Fill ``room.hit`` with those of the first ``n`` points whose measured distance is within; how many."""
     n_hits = 0
-    for j in range(n):
-        near.hit[n_hits] = j
-        n_hits += near.sq[j] <= sq_radius
+    for j in range(n):  # without a branch: which points are within cannot be foreseen
+        room.hit[n_hits] = j
+        n_hits += room.sq[j] <= sq_radius
     return n_hits
 
 
-class Nearest(NamedTuple):
-    """The nearest points of each query of a block, and room to sort them.
-
-    Attributes
-    ----------
-    sq : (b, k) float64, m2
-        Squared distances, nearest first.
-    idx : (b, k) int32
-        Indices in the cloud; the lower of equally near ones comes first.
-    n : (b,) int32
-        How many there are.
-    best_sq, best_idx, bucket
-        Room to sort.
-    """
-
-    sq: npt.NDArray[np.float64]
-    idx: npt.NDArray[np.int32]
-    n: npt.NDArray[np.int32]
-    best_sq: npt.NDArray[np.float64]
-    best_idx: npt.NDArray[np.int32]
-    bucket: npt.NDArray[np.int32]
-
-
 @njit(nogil=True, cache=True)
-def room_for_nearest(k):  # type: ignore[no-untyped-def]
-    """Room for the ``k`` nearest points of each query of a block."""
-    return Nearest(
-        np.empty((MOST_IN_BLOCK, k), dtype=np.float64),
-        np.empty((MOST_IN_BLOCK, k), dtype=np.int32),
-        np.empty(MOST_IN_BLOCK, dtype=np.int32),
-        np.empty(k, dtype=np.float64),
-        np.empty(k, dtype=np.int32),
-        np.empty(2 * k + 24, dtype=np.int32),
-    )
+def nearest_of_block(room, queries, start, stop, cells, guess, max_distance):  # type: ignore[no-untyped-def]
+    """Fill the nearest points of the queries [start, stop) of a block, those of the first query in the first row.
 
-
-@njit(nogil=True, cache=True)
-def nearest_of_block(cells, queries, start, stop, guess, max_distance, skips_self, near, found):  # type: ignore[no-untyped-def]
-    """Fill ``found`` for sorted queries [start, stop) of one block, the first row for the first query.
-
-    ``guess`` is how far to look at first, m: a matter of speed only. ``skips_self`` leaves out the point that has the
-    index of the query. Returns the surroundings, perhaps with more room, and the guess that suits a next block.
+    ``guess`` is how far to look at first, m: a matter of speed only. Returns the guess that suits a next block; -1 if
+    there is not enough room.
     """
-    k = found.idx.shape[1]
+    k = room.nearest_idx.shape[1]
     box = box_of(queries, start, stop)
     farthest = min(max_distance, distance_to_far_corner(cells, box))
     radius = min(guess, farthest)
     sq_expected, sq_longest = radius * radius, 0.0
-    found.n[: stop - start] = -1
+    for row in range(stop - start):
+        room.n_nearest[row] = -1
     n_left = stop - start
     while n_left > 0:
-        n = around(cells, box, radius, near)
-        if n > len(near.sq):
-            near = room_for(2 * n)
-            around(cells, box, radius, near)
+        n = around(room, cells, box, radius)
+        if n < 0:
+            return -1.0
         fewest = k
-        for q in range(start, stop):
-            row = q - start
-            if found.n[row] >= 0:
+        for row in range(stop - start):
+            if room.n_nearest[row] >= 0:
                 continue
-            skip = queries.idx[q] if skips_self else -1
-            measure(near, n, queries.xyz[q, 0], queries.xyz[q, 1], queries.xyz[q, 2])
-            n_found = _best_hits(near, n, min(sq_expected, radius * radius), skip, found, row)
+            q = start + row
+            measure(room, n, queries.xyz[q, 0], queries.xyz[q, 1], queries.xyz[q, 2])
+            n_found = _sort_hits(room, n, min(sq_expected, radius * radius), row)
             if n_found < k and sq_expected < radius * radius:
-                n_found = _best_hits(near, n, radius * radius, skip, found, row)
+                n_found = _sort_hits(room, n, radius * radius, row)
             if n_found == k or radius >= farthest:
                 n_left -= 1
-                found.n[row] = n_found
-                sq_reached = found.sq[row, k - 1] if n_found == k else radius * radius
+                room.n_nearest[row] = n_found
+                sq_reached = room.nearest_sq[row, k - 1] if n_found == k else radius * radius
                 sq_expected, sq_longest = 1.3 * sq_reached, max(sq_longest, sq_reached)
             fewest = min(fewest, n_found)
         radius = min(radius * min(max(1.1 * np.sqrt(k / (fewest + 1.0)), 1.3), 2.0), farthest)
-    return near, max(min(1.1 * np.sqrt(sq_longest), 2 * guess), 0.25 * cells.cell_m)
+    return max(min(1.1 * np.sqrt(sq_longest), 2 * guess), 0.25 * cells.cell_m)
 
 
 @njit(nogil=True, cache=True)
 def distance_to_far_corner(cells, box):  # type: ignore[no-untyped-def]
-    """At least as far as any point is from any place in the box, m."""
+    """At least as far, m, as any point is from any place in a box."""
     x0, x1, y0, y1, z0, z1 = box
     dx = max(cells.high[0] - x0, x1 - cells.low[0])
     dy = max(cells.high[1] - y0, y1 - cells.low[1])
@@ -232,36 +253,34 @@ def distance_to_far_corner(cells, box):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _best_hits(near, n, sq_radius, skip, found, row):  # type: ignore[no-untyped-def]
-    """Fill a row of ``found`` with the best of the measured points within, by (distance, index); how many there are."""
-    n_hits = hits_within(near, n, sq_radius)
-    _presort(near, n_hits, sq_radius, found.bucket)
+def _sort_hits(room, n, sq_radius, row):  # type: ignore[no-untyped-def]
+    """Fill a row with the nearest of the measured points within; how many there are."""
+    n_hits = hits_within(room, n, sq_radius)
+    _order_by_ring(room, n_hits, sq_radius)
     n_found = 0
     for h in range(n_hits):
-        j = near.order[h]
-        if near.idx[j] != skip:
-            n_found = insert(near.sq[j], near.idx[j], found.best_sq, found.best_idx, n_found)
+        j = room.order[h]
+        n_found = insert(room.sq[j], room.idx[j], room.best_sq, room.best_idx, n_found)
     for j in range(n_found):
-        found.sq[row, j], found.idx[row, j] = found.best_sq[j], found.best_idx[j]
+        room.nearest_sq[row, j], room.nearest_idx[row, j] = room.best_sq[j], room.best_idx[j]
     return n_found
 
 
 @njit(nogil=True, cache=True)
-def _presort(near, n_hits, sq_radius, bucket):  # type: ignore[no-untyped-def]
-    """Fill ``near.order`` with the hits, almost by distance: to insert them is then hardly any work."""
-    n_buckets = len(bucket) - 1
-    scale = (n_buckets - 0.5) / max(sq_radius, 1e-300)
-    for b in range(n_buckets):
-        bucket[b] = 0
+def _order_by_ring(room, n_hits, sq_radius):  # type: ignore[no-untyped-def]
+    """Order the hits by rings of equal area, and so almost by distance: to insert them is then hardly any work."""
+    scale = (len(room.ring) - 1.5) / max(sq_radius, 1e-300)
+    for r in range(len(room.ring)):
+        room.ring[r] = 0
     for h in range(n_hits):
-        bucket[int(near.sq[near.hit[h]] * scale) + 1] += 1
-    for b in range(1, n_buckets):
-        bucket[b] += bucket[b - 1]
+        room.ring[int(room.sq[room.hit[h]] * scale) + 1] += 1
+    for r in range(1, len(room.ring)):
+        room.ring[r] += room.ring[r - 1]
     for h in range(n_hits):
-        j = near.hit[h]
-        b = int(near.sq[j] * scale)
-        near.order[bucket[b]] = j
-        bucket[b] += 1
+        j = room.hit[h]
+        r = int(room.sq[j] * scale)
+        room.order[room.ring[r]] = j
+        room.ring[r] += 1
 
 
 @njit(nogil=True, cache=True)

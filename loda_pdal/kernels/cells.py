@@ -35,9 +35,6 @@ from loda_pdal.kernels.parallel import run_ranges
 MOST_CELLS_ALONG = 1 << 22
 """Cells along x or y; a list that would need more gets larger cells."""
 
-POINTS_PER_COLUMN = 24
-"""Points per column, on average, at which searches in blocks are quickest."""
-
 FloatArray = npt.NDArray[np.float64]
 Float32Array = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int32]
@@ -98,11 +95,15 @@ def build_cells(xyz: npt.NDArray[Any], cell_m: float, centre: FloatArray | None 
     n_x, n_y = (int(np.floor(span / cell)) + 1 for span in (high - low)[:2])
     cell_xy = np.empty((2, n), dtype=np.int32)
     run_ranges(_cell_range, n, local, low, cell, cell_xy)
-    order = _sorted_by(cell_xy[1], n_y, np.arange(n, dtype=np.int32))
-    order = _sorted_by(cell_xy[0], n_x, order)
-    row_start, column_y, column_start = _columns(cell_xy, n_x, order)
-    sorted_xyz, idx = np.empty_like(local), np.empty_like(order)
-    run_ranges(_sort_column_range, len(column_y), column_start, order, local, local.view(np.int32), sorted_xyz, idx)
+    by_y, idx = np.arange(n, dtype=np.int32), np.empty(n, dtype=np.int32)
+    _sort_by(cell_xy[1], np.zeros(n_y + 1, dtype=np.int32), by_y.copy(), by_y)
+    _sort_by(cell_xy[0], np.zeros(n_x + 1, dtype=np.int32), by_y, idx)
+    row_start = np.zeros(n_x + 1, dtype=np.int32)
+    column_y, column_start = np.empty(n, dtype=np.int32), np.empty(n + 1, dtype=np.int32)
+    n_columns = _find_columns(cell_xy, idx, row_start, column_y, column_start)
+    column_y, column_start = column_y[:n_columns].copy(), column_start[: n_columns + 1].copy()
+    sorted_xyz, key = np.empty_like(local), np.empty(n, dtype=np.int64)
+    run_ranges(_sort_column_range, n_columns, column_start, local, local.view(np.int32), key, idx, sorted_xyz)
     return CellList(sorted_xyz, idx, row_start, column_y, column_start, low, high, cell, centre)
 
 
@@ -115,16 +116,6 @@ def extent(xyz: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
         return np.zeros(xyz.shape[1]), np.zeros(xyz.shape[1])
     low, high = ([reduce(column) for column in xyz.T] for reduce in (np.min, np.max))
     return np.array(low, dtype=np.float64), np.array(high, dtype=np.float64)
-
-
-def block_edge(xyz: npt.NDArray[Any], k: int = 1) -> float:
-    """Column edge (m) that leaves `POINTS_PER_COLUMN`, or k, to each occupied column: a matter of speed only."""
-    low, high = extent(xyz[:, :2])
-    edge = max(float((high - low).max()) / 512, 1e-3)
-    is_occupied = np.zeros((514, 514), dtype=np.bool_)
-    is_occupied[tuple(((xyz[:, axis] - low[axis]) / edge).astype(np.int32) for axis in range(2))] = True
-    density = max(len(xyz), 1) / max(np.count_nonzero(is_occupied), 1)
-    return edge * float(np.clip(np.sqrt(max(k, POINTS_PER_COLUMN) / density), 0.02, 20.0))
 
 
 def middle_of(xyz: npt.NDArray[Any]) -> FloatArray:
@@ -151,68 +142,60 @@ def _cell_range(start, stop, xyz, low, cell, cell_xy):  # type: ignore[no-untype
 
 
 @njit(nogil=True, cache=True)
-def _sorted_by(key, n_keys, order):  # type: ignore[no-untyped-def]
-    """``order`` (n,) int32 sorted by the key (n,) in [0, n_keys) of its elements; equal ones stay in order."""
-    start = np.zeros(n_keys + 1, dtype=np.int32)
+def _sort_by(key, start, order, result):  # type: ignore[no-untyped-def]
+    """Fill ``result`` with the indices ``order`` by their key; equal ones stay in order. ``start`` is all zeros."""
     for i in range(len(key)):
         start[key[i] + 1] += 1
-    for k in range(n_keys):
-        start[k + 1] += start[k]
-    result = np.empty_like(order)
-    for i in order:
+    for k in range(1, len(start)):
+        start[k] += start[k - 1]
+    for j in range(len(order)):
+        i = order[j]
         result[start[key[i]]] = i
         start[key[i]] += 1
-    return result
 
 
 @njit(nogil=True, cache=True)
-def _columns(cell_xy, n_x, order):  # type: ignore[no-untyped-def]
-    """``row_start``, ``column_y`` and ``column_start`` of a `CellList`, of points in order of their columns."""
-    n = len(order)
-    row_start = np.zeros(n_x + 1, dtype=np.int32)
-    column_y = np.empty(n, dtype=np.int32)
-    column_start = np.empty(n + 1, dtype=np.int32)
+def _find_columns(cell_xy, idx, row_start, column_y, column_start):  # type: ignore[no-untyped-def]
+    """Fill three arrays of a `CellList`, given the points by column; how many columns. ``row_start`` is all zeros."""
     n_columns, x, y = 0, -1, -1
-    for p in range(n):
-        i = order[p]
+    for p in range(len(idx)):
+        i = idx[p]
         if cell_xy[0, i] != x or cell_xy[1, i] != y:
             x, y = cell_xy[0, i], cell_xy[1, i]
             row_start[x + 1] += 1
             column_y[n_columns] = y
             column_start[n_columns] = p
             n_columns += 1
-    column_start[n_columns] = n
-    for x in range(n_x):
-        row_start[x + 1] += row_start[x]
-    return row_start, column_y[:n_columns].copy(), column_start[: n_columns + 1].copy()
+    column_start[n_columns] = len(idx)
+    for row in range(1, len(row_start)):
+        row_start[row] += row_start[row - 1]
+    return n_columns
 
 
 @njit(nogil=True, cache=True)
-def _sort_column_range(start, stop, column_start, order, xyz, xyz_bits, sorted_xyz, idx):  # type: ignore[no-untyped-def]
-    """Fill sorted points and indices of columns [start, stop): Shell sort by height, then index, in one int64."""
-    key = np.empty(np.max(np.diff(column_start[start : stop + 1])), dtype=np.int64)
+def _sort_column_range(start, stop, column_start, xyz, xyz_bits, key, idx, sorted_xyz):  # type: ignore[no-untyped-def]
+    """Sort the points of columns [start, stop) by height, then index: Shell sort of both in one integer."""
     for column in range(start, stop):
-        first, n = column_start[column], column_start[column + 1] - column_start[column]
-        for j in range(n):
-            bits = np.int64(xyz_bits[order[first + j], 2])
+        first, last = column_start[column], column_start[column + 1]
+        for p in range(first, last):
+            bits = np.int64(xyz_bits[idx[p], 2])
             height = bits if bits >= 0 else -(bits & 0x7FFFFFFF)  # integers in the order of the float32
-            key[j] = (height << 32) | order[first + j]
+            key[p] = (height << 32) | idx[p]
         gap = 1
-        while gap < n // 3:
+        while 3 * gap < last - first:
             gap = 3 * gap + 1
         while gap > 0:
-            for j in range(gap, n):
-                value, at = key[j], j
-                while at >= gap and key[at - gap] > value:
+            for p in range(first + gap, last):
+                value, at = key[p], p
+                while at >= first + gap and key[at - gap] > value:
                     key[at] = key[at - gap]
                     at -= gap
                 key[at] = value
             gap //= 3
-        for j in range(n):
-            i = key[j] & 0x7FFFFFFF
-            idx[first + j] = i
-            for axis in range(3):
-                sorted_xyz[first + j, axis] = xyz[i, axis]
+        for p in range(first, last):
+            i = key[p] & 0x7FFFFFFF
+            idx[p] = i
+            sorted_xyz[p, 0], sorted_xyz[p, 1], sorted_xyz[p, 2] = xyz[i, 0], xyz[i, 1], xyz[i, 2]
 
 
 @njit(nogil=True, cache=True)

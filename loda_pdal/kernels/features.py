@@ -5,42 +5,38 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from loda_pdal.kernels.blocks import around, box_of, end_of_block, hits_within, measure, room_for
+from loda_pdal.kernels.blocks import around, box_of, hits_within, measure
 from loda_pdal.kernels.geometry import eigen_symmetric_3x3
 
 
 @njit(nogil=True, cache=True)
-def shape_features(start, stop, cells, radius, min_neighbours, values, normals, is_valid):  # type: ignore[no-untyped-def]
-    """Linearity, planarity, sphericity, |n.z| and normals of the points in columns [start, stop) of a cell list.
+def shape_features(  # type: ignore[no-untyped-def]
+    start, stop, room, blocks, cells, radius, min_neighbours, values, normals, is_valid
+):
+    """Linearity, planarity, sphericity, |n.z| and normals of the points in blocks [start, stop), see `run_blocks`.
 
     Results are written at the index that each point has in the cloud; points with too few neighbours are left alone.
     """
-    near = room_for(1024)
-    for column in range(start, stop):
-        q, column_stop = cells.column_start[column], cells.column_start[column + 1]
-        while q < column_stop:
-            block_stop = end_of_block(cells, q, column_stop)
-            box = box_of(cells, q, block_stop)
-            n = around(cells, box, radius, near)
-            if n > len(near.sq):
-                near = room_for(2 * n)
-                around(cells, box, radius, near)
-            while q < block_stop:
-                measure(near, n, cells.xyz[q, 0], cells.xyz[q, 1], cells.xyz[q, 2])
-                n_hits = hits_within(near, n, radius * radius)
-                if n_hits >= min_neighbours:
-                    _shape(near, n_hits, cells.xyz, q, 1e-12 * radius * radius, cells.idx[q], values, normals, is_valid)
-                q += 1
+    for block in range(start, stop):
+        n = around(room, cells, box_of(cells, blocks[block], blocks[block + 1]), radius)
+        if n < 0:
+            return block
+        for q in range(blocks[block], blocks[block + 1]):
+            x, y, z = np.float64(cells.xyz[q, 0]), np.float64(cells.xyz[q, 1]), np.float64(cells.xyz[q, 2])
+            measure(room, n, x, y, z)
+            n_hits = hits_within(room, n, radius * radius)
+            if n_hits >= min_neighbours:
+                _shape(room, n_hits, x, y, z, 1e-12 * radius * radius, cells.idx[q], values, normals, is_valid)
+    return stop
 
 
 @njit(nogil=True, cache=True)
-def _shape(near, n, xyz, q, smallest, i, values, normals, is_valid):  # type: ignore[no-untyped-def]
-    """Write the features of sorted point ``q`` at ``i``, unless all its ``n`` neighbours are in one place."""
-    x, y, z = np.float64(xyz[q, 0]), np.float64(xyz[q, 1]), np.float64(xyz[q, 2])
+def _shape(room, n, x, y, z, smallest, i, values, normals, is_valid):  # type: ignore[no-untyped-def]
+    """Write features at ``i``, of ``n`` hits around (x, y, z), unless these are all in one place."""
     sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
     for h in range(n):
-        j = near.hit[h]
-        dx, dy, dz = near.x[j] - x, near.y[j] - y, near.z[j] - z
+        j = room.hit[h]
+        dx, dy, dz = room.x[j] - x, room.y[j] - y, room.z[j] - z
         sx, sy, sz = sx + dx, sy + dy, sz + dz
         sxx, sxy, sxz = sxx + dx * dx, sxy + dx * dy, sxz + dx * dz
         syy, syz, szz = syy + dy * dy, syz + dy * dz, szz + dz * dz

@@ -5,7 +5,6 @@ Ties go to the lower index, so results depend neither on the cell size nor on th
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,16 +13,14 @@ from numba import njit
 
 from loda_pdal.kernels.blocks import (
     around,
+    block_edge,
     box_of,
     distance_to_far_corner,
-    end_of_block,
     hits_within,
     insert,
     measure,
     nearest_of_block,
-    room_for,
-    room_for_nearest,
-    run_columns,
+    run_blocks,
 )
 from loda_pdal.kernels.cells import (
     CellList,
@@ -31,7 +28,6 @@ from loda_pdal.kernels.cells import (
     FloatArray,
     Int64Array,
     IntArray,
-    block_edge,
     build_cells,
     cells_between,
     empty_runs,
@@ -43,7 +39,25 @@ from loda_pdal.kernels.cells import (
     sq_gap_to_column,
     to_cell_frame,
 )
-from loda_pdal.kernels.parallel import run_ranges
+
+__all__ = [
+    "CellList",
+    "NeighbourLists",
+    "NeighbourTable",
+    "build_cells",
+    "count_neighbours",
+    "empty_runs",
+    "k_nearest",
+    "k_within",
+    "knn",
+    "mean_distances",
+    "middle_of",
+    "nearest",
+    "radius_neighbours",
+    "runs_within",
+    "sq_distance",
+    "to_cell_frame",
+]
 
 
 class NeighbourTable(NamedTuple):
@@ -90,11 +104,11 @@ def knn(
     """
     cells = build_cells(xyz, block_edge(xyz, k))
     asked = cells if queries is None else _like(cells, queries)
-    skips_self = queries is None and not includes_self
-    idx = np.full((len(asked.xyz), k), -1, dtype=np.int32)
-    distance = np.full((len(asked.xyz), k), np.inf, dtype=np.float32)
-    if len(cells.xyz):
-        run_columns(_knn_range, asked, cells, float(max_distance), skips_self, idx, distance)
+    includes_self = includes_self or queries is not None
+    idx = np.empty((len(asked.xyz), k), dtype=np.int32)
+    distance = np.empty((len(asked.xyz), k), dtype=np.float32)
+    room = k if includes_self else k + 1
+    run_blocks(_knn_range, asked, cells, float(max_distance), includes_self, idx, distance, k=room)
     return NeighbourTable(idx, distance)
 
 
@@ -114,6 +128,14 @@ def nearest(
     return found.idx[:, 0], found.distance[:, 0]
 
 
+def mean_distances(xyz: npt.NDArray[Any], k: int) -> FloatArray:
+    """Mean distance, m, of each point of a cloud (n, 3) to its k nearest others, (n,) float64; k is less than n."""
+    cells = build_cells(xyz, block_edge(xyz, k))
+    mean = np.empty(len(xyz), dtype=np.float64)
+    run_blocks(_mean_distance_range, cells, mean, k=k + 1)
+    return mean
+
+
 def radius_neighbours(xyz: npt.NDArray[Any], radius: float, queries: npt.NDArray[Any] | None = None) -> NeighbourLists:
     """All points of a cloud (n, 3) within ``radius``, m, of each query (q, 3), the cloud itself by default.
 
@@ -122,10 +144,10 @@ def radius_neighbours(xyz: npt.NDArray[Any], radius: float, queries: npt.NDArray
     cells = build_cells(xyz, max(radius, block_edge(xyz)))
     asked = cells if queries is None else _like(cells, queries)
     starts = np.zeros(len(asked.xyz) + 1, dtype=np.int64)
-    run_columns(_count_range, asked, cells, float(radius), starts[1:])
+    run_blocks(_count_range, asked, cells, float(radius), starts[1:])
     np.cumsum(starts, out=starts)
     idx = np.empty(starts[-1], dtype=np.int32)
-    run_columns(_fill_range, asked, cells, float(radius), starts, idx)
+    run_blocks(_fill_range, asked, cells, float(radius), starts, idx)
     return NeighbourLists(starts, idx)
 
 
@@ -133,7 +155,7 @@ def count_neighbours(xyz: npt.NDArray[Any], radius: float) -> Int64Array:
     """How many points of a cloud (n, 3) lie within ``radius``, m, of each of its points, itself included, (n,)."""
     cells = build_cells(xyz, max(radius, block_edge(xyz)))
     counts = np.zeros(len(xyz), dtype=np.int64)
-    run_columns(_count_range, cells, cells, float(radius), counts)
+    run_blocks(_count_range, cells, cells, float(radius), counts)
     return counts
 
 
@@ -143,58 +165,69 @@ def _like(cells: CellList, queries: npt.NDArray[Any]) -> CellList:
 
 
 @njit(nogil=True, cache=True)
-def _knn_range(start, stop, queries, cells, max_distance, skips_self, idx, distance):  # type: ignore[no-untyped-def]
-    near, found = room_for(1024), room_for_nearest(idx.shape[1])
+def _knn_range(  # type: ignore[no-untyped-def]
+    start, stop, room, blocks, queries, cells, max_distance, includes_self, idx, distance
+):
     guess = cells.cell_m
-    for column in range(start, stop):
-        q, column_stop = queries.column_start[column], queries.column_start[column + 1]
-        while q < column_stop:
-            block_stop = end_of_block(queries, q, column_stop)
-            near, guess = nearest_of_block(cells, queries, q, block_stop, guess, max_distance, skips_self, near, found)
-            for row in range(block_stop - q):
-                i = queries.idx[q + row]
-                for j in range(found.n[row]):
-                    idx[i, j] = found.idx[row, j]
-                    distance[i, j] = np.sqrt(found.sq[row, j])
-            q = block_stop
+    for block in range(start, stop):
+        first, last = blocks[block], blocks[block + 1]
+        guess = nearest_of_block(room, queries, first, last, cells, guess, max_distance)
+        if guess < 0.0:
+            return block
+        for q in range(first, last):
+            row, i, n = q - first, queries.idx[q], 0
+            for j in range(room.n_nearest[row]):
+                if n < idx.shape[1] and (includes_self or room.nearest_idx[row, j] != i):
+                    idx[i, n] = room.nearest_idx[row, j]
+                    distance[i, n] = np.sqrt(room.nearest_sq[row, j])
+                    n += 1
+            for j in range(n, idx.shape[1]):
+                idx[i, j] = -1
+                distance[i, j] = np.inf
+    return stop
 
 
 @njit(nogil=True, cache=True)
-def _count_range(start, stop, queries, cells, radius, counts):  # type: ignore[no-untyped-def]
-    near = room_for(1024)
-    for column in range(start, stop):
-        q, column_stop = queries.column_start[column], queries.column_start[column + 1]
-        while q < column_stop:
-            block_stop = end_of_block(queries, q, column_stop)
-            box = box_of(queries, q, block_stop)
-            n = around(cells, box, radius, near)
-            if n > len(near.sq):
-                near = room_for(2 * n)
-                around(cells, box, radius, near)
-            while q < block_stop:
-                measure(near, n, queries.xyz[q, 0], queries.xyz[q, 1], queries.xyz[q, 2])
-                counts[queries.idx[q]] = hits_within(near, n, radius * radius)
-                q += 1
+def _mean_distance_range(start, stop, room, blocks, cells, mean):  # type: ignore[no-untyped-def]
+    guess = cells.cell_m
+    for block in range(start, stop):
+        first, last = blocks[block], blocks[block + 1]
+        guess = nearest_of_block(room, cells, first, last, cells, guess, np.inf)
+        if guess < 0.0:
+            return block
+        for q in range(first, last):
+            row, n, total = q - first, 0, 0.0
+            for j in range(room.n_nearest[row]):
+                if n < room.nearest_idx.shape[1] - 1 and room.nearest_idx[row, j] != cells.idx[q]:
+                    total += np.float64(np.float32(np.sqrt(room.nearest_sq[row, j])))
+                    n += 1
+            mean[cells.idx[q]] = total / n
+    return stop
 
 
 @njit(nogil=True, cache=True)
-def _fill_range(start, stop, queries, cells, radius, starts, idx):  # type: ignore[no-untyped-def]
-    near = room_for(1024)
-    for column in range(start, stop):
-        q, column_stop = queries.column_start[column], queries.column_start[column + 1]
-        while q < column_stop:
-            block_stop = end_of_block(queries, q, column_stop)
-            box = box_of(queries, q, block_stop)
-            n = around(cells, box, radius, near)
-            if n > len(near.sq):
-                near = room_for(2 * n)
-                around(cells, box, radius, near)
-            while q < block_stop:
-                measure(near, n, queries.xyz[q, 0], queries.xyz[q, 1], queries.xyz[q, 2])
-                first = starts[queries.idx[q]]
-                for h in range(hits_within(near, n, radius * radius)):
-                    idx[first + h] = near.idx[near.hit[h]]
-                q += 1
+def _count_range(start, stop, room, blocks, queries, cells, radius, counts):  # type: ignore[no-untyped-def]
+    for block in range(start, stop):
+        n = around(room, cells, box_of(queries, blocks[block], blocks[block + 1]), radius)
+        if n < 0:
+            return block
+        for q in range(blocks[block], blocks[block + 1]):
+            measure(room, n, queries.xyz[q, 0], queries.xyz[q, 1], queries.xyz[q, 2])
+            counts[queries.idx[q]] = hits_within(room, n, radius * radius)
+    return stop
+
+
+@njit(nogil=True, cache=True)
+def _fill_range(start, stop, room, blocks, queries, cells, radius, starts, idx):  # type: ignore[no-untyped-def]
+    for block in range(start, stop):
+        n = around(room, cells, box_of(queries, blocks[block], blocks[block + 1]), radius)
+        if n < 0:
+            return block
+        for q in range(blocks[block], blocks[block + 1]):
+            measure(room, n, queries.xyz[q, 0], queries.xyz[q, 1], queries.xyz[q, 2])
+            for h in range(hits_within(room, n, radius * radius)):
+                idx[starts[queries.idx[q]] + h] = room.idx[room.hit[h]]
+    return stop
 
 
 @njit(nogil=True, cache=True)
@@ -241,5 +274,3 @@ def k_within(cells, x, y, z, radius, skip, best_sq, best_idx):  # type: ignore[n
                     p += 1
             c += 1
     return n_found
-
-

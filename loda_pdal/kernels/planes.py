@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from loda_pdal.kernels.blocks import end_of_block, nearest_of_block, room_for, room_for_nearest
+from loda_pdal.kernels.blocks import nearest_of_block
 from loda_pdal.kernels.geometry import eigen_symmetric_3x3
 
 LINE = 1e-3
@@ -14,18 +14,19 @@ LINE = 1e-3
 
 @njit(nogil=True, cache=True)
 def plane_range(  # type: ignore[no-untyped-def]
-    start, stop, cells, local, radius, k, min_neighbours, max_isotropy, normals, roughness
+    start, stop, room, blocks, cells, local, radius, min_neighbours, max_isotropy, normals, roughness
 ):
-    """Normals and roughness of the points in columns [start, stop), written under their index in the cloud.
+    """Normals and roughness of the points in blocks [start, stop), written under their index in the cloud.
 
     Parameters
     ----------
-    cells : CellList
+    room, blocks, cells
+        See `run_blocks`, as for what is returned.
     local : (n, 3) float32, m
         The points about ``cells.centre``, by their index in the cloud.
-    radius, k, min_neighbours
-        At most the k nearest points within the radius (m), the point itself among them; no plane with fewer than
-        ``min_neighbours``.
+    radius, min_neighbours
+        The nearest points within the radius (m), the point itself among them, as many as there is room for; no plane
+        with fewer than ``min_neighbours``.
     max_isotropy : float
         No plane where smallest over middle eigenvalue exceeds this.
     normals : (n, 3) float32
@@ -33,26 +34,27 @@ def plane_range(  # type: ignore[no-untyped-def]
     roughness : (n,) float32, m
         1.4826 * MAD of the signed distances to the plane; left alone where there is no plane.
     """
-    near, found, guess = room_for(1024), room_for_nearest(k), min(cells.cell_m, radius)
+    k = room.nearest_idx.shape[1]
+    guess = min(cells.cell_m, radius)
     residual, ordered, place = np.empty(k), np.empty(k), np.empty(k, dtype=np.int32)
-    for column in range(start, stop):
-        q, column_stop = cells.column_start[column], cells.column_start[column + 1]
-        while q < column_stop:
-            block_stop = end_of_block(cells, q, column_stop)
-            near, guess = nearest_of_block(cells, cells, q, block_stop, guess, radius, False, near, found)
-            for row in range(block_stop - q):
-                n, i = found.n[row], cells.idx[q + row]
-                if n < min_neighbours:
-                    continue
-                x, y, z, large, middle, small, nx, ny, nz = _plane(local, found.idx, row, n)
-                if middle <= LINE * large or small > max_isotropy * middle:
-                    continue
-                normals[i, 0], normals[i, 1], normals[i, 2] = nx, ny, nz
-                for j in range(n):
-                    p = found.idx[row, j]
-                    residual[j] = nx * (local[p, 0] - x) + ny * (local[p, 1] - y) + nz * (local[p, 2] - z)
-                roughness[i] = mad_sigma(residual, n, ordered, place)
-            q = block_stop
+    for block in range(start, stop):
+        first, last = blocks[block], blocks[block + 1]
+        guess = nearest_of_block(room, cells, first, last, cells, guess, radius)
+        if guess < 0.0:
+            return block
+        for row in range(last - first):
+            n, i = room.n_nearest[row], cells.idx[first + row]
+            if n < min_neighbours:
+                continue
+            x, y, z, large, middle, small, nx, ny, nz = _plane(local, room.nearest_idx, row, n)
+            if middle <= LINE * large or small > max_isotropy * middle:
+                continue
+            normals[i, 0], normals[i, 1], normals[i, 2] = nx, ny, nz
+            for j in range(n):
+                p = room.nearest_idx[row, j]
+                residual[j] = nx * (local[p, 0] - x) + ny * (local[p, 1] - y) + nz * (local[p, 2] - z)
+            roughness[i] = mad_sigma(residual, n, ordered, place)
+    return stop
 
 
 @njit(nogil=True, cache=True)
@@ -81,8 +83,7 @@ def mad_sigma(values, n, ordered, place):  # type: ignore[no-untyped-def]
     """
     _sort(values, n, ordered, place)
     middle = 0.5 * (ordered[(n - 1) // 2] + ordered[n // 2])
-    # deviations grow from the middle to both ends: two pointers meet them in order
-    above = n // 2
+    above = n // 2  # deviations grow from here to both ends, so two pointers meet them in order
     below = above - 1
     deviation = last = 0.0
     for _ in range(n // 2 + 1):

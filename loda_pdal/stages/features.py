@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loda_pdal.kernels.blocks import run_columns
-from loda_pdal.kernels.cells import block_edge, build_cells
+from loda_pdal.kernels.blocks import block_edge, run_blocks
+from loda_pdal.kernels.cells import build_cells
 from loda_pdal.kernels.features import shape_features
 from loda_pdal.model.cloud import BoolArray, Float32Array, FloatArray
 from loda_pdal.params import FeatureParams
@@ -65,7 +65,6 @@ def eigen_features(xyz: FloatArray, height: FloatArray, params: FeatureParams) -
     values[:, 4] = np.nan_to_num(height, nan=0.0)
     normals = np.zeros((m, 3), dtype=np.float32)
     is_valid = np.zeros(m, dtype=np.bool_)
-    if m:
-        cells = build_cells(xyz, max(params.radius_m, block_edge(xyz)))
-        run_columns(shape_features, cells, params.radius_m, params.min_neighbours, values, normals, is_valid)
+    cells = build_cells(xyz, max(params.radius_m, block_edge(xyz)))
+    run_blocks(shape_features, cells, params.radius_m, params.min_neighbours, values, normals, is_valid)
     return Features(values, normals, is_valid)

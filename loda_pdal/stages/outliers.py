@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from loda_pdal.kernels.neighbours import knn
+from loda_pdal.kernels.neighbours import mean_distances
 from loda_pdal.model.cloud import BoolArray, FloatArray, VoxelCloud
 from loda_pdal.params import OutlierParams
 
@@ -37,20 +35,16 @@ def find_outliers(xyz: FloatArray, params: OutlierParams) -> BoolArray:
     Returns
     -------
     (m,) bool
-        Mean and (sample) standard deviation are exactly rounded sums over all points, whatever their order.
+        Mean and (sample) standard deviation are sums in ascending order, so the order of the points does not matter.
     """
     distance = mean_neighbour_distance(xyz, params.k)
-    n = len(distance)
-    if n < 2:
-        return np.zeros(n, dtype=np.bool_)
-    mean = math.fsum(distance) / n
-    deviation = math.sqrt(math.fsum((distance - mean) ** 2) / (n - 1))
-    return np.asarray(distance > mean + params.std_multiplier * deviation)
+    if len(distance) < 2:
+        return np.zeros(len(distance), dtype=np.bool_)
+    ascending = np.sort(distance)
+    return np.asarray(distance > ascending.mean() + params.std_multiplier * ascending.std(ddof=1))
 
 
 def mean_neighbour_distance(xyz: FloatArray, k: int) -> FloatArray:
     """Mean distance (m,) float64, m, to the k nearest other points, or to all others where there are fewer than k."""
     k = min(k, len(xyz) - 1)
-    if k < 1:
-        return np.zeros(len(xyz))
-    return np.asarray(knn(xyz, k, includes_self=False).distance.mean(axis=1, dtype=np.float64))
+    return mean_distances(xyz, k) if k > 0 else np.zeros(len(xyz))
