@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from loda_pdal.kernels.ground_planes import fit_planes
+from loda_pdal.kernels.ground_raster import group_by_cell, relax, sort_range
 from loda_pdal.model.cloud import to_local_grid
 from loda_pdal.params import Parameters
 from loda_pdal.stages.fuse import fuse_points
@@ -149,6 +150,32 @@ def test_height_is_the_bilinear_mean_of_the_planes_around() -> None:
     np.testing.assert_allclose(model.height_at(xy), expected, rtol=0, atol=1e-12)
 
 
+<<<<<<< HEAD
+=======
+def test_points_are_sorted_by_cell_and_then_by_place() -> None:
+    rng = np.random.default_rng(2)
+    xyz = rng.integers(0, 4, (3000, 3)).astype(float)  # many equal coordinates
+    cell_idx = rng.integers(0, 7, len(xyz)) ** 2
+    start, order = np.searchsorted(np.sort(cell_idx), np.arange(51)), np.empty(len(xyz), np.int64)
+    group_by_cell(cell_idx, start[:-1].copy(), order)
+    np.testing.assert_array_equal(order, np.argsort(cell_idx, kind="stable"))
+    sort_range(0, 50, start, xyz, order)
+    np.testing.assert_array_equal(order, np.lexsort((xyz[:, 2], xyz[:, 1], xyz[:, 0], cell_idx)))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 6), (5, 1), (2, 2), (7, 9)])
+def test_gaps_relax_towards_their_neighbours(shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(4)
+    height, is_known = rng.normal(size=shape), rng.random(shape) < 0.4
+    expected = height
+    for _ in range(5):
+        padded = np.pad(expected, 1, mode="edge")
+        mean = (padded[2:, 1:-1] + padded[:-2, 1:-1] + padded[1:-1, 2:] + padded[1:-1, :-2]) / 4
+        expected = np.where(is_known, height, mean)
+    np.testing.assert_allclose(relax(height.copy(), is_known, 5), expected, rtol=0, atol=1e-14)
+
+
+>>>>>>> w-c
 def test_objects_cut_out_of_their_scene_have_no_ground() -> None:
     rng = np.random.default_rng(8)
     feet = [(4.0 * i, 5.0 * j) for i in range(6) for j in range(6)]

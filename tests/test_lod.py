@@ -151,6 +151,31 @@ def test_kernel_agrees_with_a_slow_twin() -> None:
         assert grid.displacement[c] == pytest.approx(offset[1] - offset[0], abs=1e-5)
 
 
+def test_limit_between_cells_is_trilinear_over_the_valid_ones() -> None:
+    rng = np.random.default_rng(3)
+    cells = np.argwhere(rng.random((6, 5, 4)) < 0.6).astype(np.int32) - 2
+    n = len(cells)
+    limit, is_valid = rng.uniform(0.01, 0.2, n).astype(np.float32), rng.random(n) < 0.7
+    nothing = np.zeros(n, np.int32)
+    grid = LodGrid(cells, 0.5, limit, np.zeros((n, 3), np.float32), nothing, nothing, is_valid, limit, 0.7)
+    place = {tuple(cell): c for c, cell in enumerate(cells)}
+    xyz = rng.uniform(-2.0, 2.5, (400, 3))
+    xyz[::7] = 0.25 * np.round(xyz[::7] / 0.25)  # on the centres, edges and corners of cells
+    expected = np.full(len(xyz), 0.7)
+    for p, at in enumerate(xyz / 0.5 - 0.5):
+        total = weight = 0.0
+        for cell in np.floor(at).astype(int) + np.argwhere(np.ones((2, 2, 2))):
+            c = place.get(tuple(cell), -1)
+            if c >= 0 and is_valid[c]:
+                w = np.prod(1 - np.abs(at - cell))
+                total, weight = total + w * limit[c], weight + w
+        if weight > 1e-6:
+            expected[p] = total / weight
+    assert 0.1 < np.mean(expected == 0.7) < 0.9
+    np.testing.assert_allclose(grid.at(xyz), expected, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(grid.at(xyz[::-1]), grid.at(xyz)[::-1])
+
+
 def test_empty_epochs() -> None:
     nothing = np.zeros((0, 3))
     assert len(level_of_detection(nothing, nothing, NO_POSE, ORIGIN, PARAMS).cells) == 0

@@ -40,9 +40,10 @@ def test_the_shipped_parameters_are_those_of_the_engine() -> None:
 
 
 def test_the_colours_are_those_of_the_engine() -> None:
-    assert tuple(
-        (int(label), label.title, colour) for label, colour in sorted(LABEL_COLOURS.items())
-    ) == legend.CHANGE_CLASSES
+    assert (
+        tuple((int(label), label.title, colour) for label, colour in sorted(LABEL_COLOURS.items()))
+        == legend.CHANGE_CLASSES
+    )
 
 
 # The code: standard library and qgis, for every QGIS from 3.34 on

@@ -345,7 +345,40 @@ def test_partners_kept_from_earlier_poses_are_those_of_a_fresh_search() -> None:
         np.testing.assert_array_equal(kept.sums, fresh.sums)
 
 
+def test_thinning_keeps_the_point_nearest_to_the_mean_of_its_voxel() -> None:
+    rng = np.random.default_rng(6)
+    xyz = rng.integers(-40, 40, (2000, 3)) / 8.0  # many points equally near
+    normals = rng.normal(size=xyz.shape).astype(np.float32)
+    surface = Surface(xyz, normals, np.arange(2000, dtype=np.float32), np.zeros(3))
+    thinned, kept = surface.thinned(1.0), []
+    voxels = np.floor(xyz).astype(int)
+    for voxel in np.unique(voxels, axis=0):
+        own = np.flatnonzero(np.all(voxels == voxel, axis=1))
+        kept.append(own[np.argmin(np.square(xyz[own] - xyz[own].mean(axis=0)).sum(axis=1))])
+    np.testing.assert_array_equal(thinned.roughness, kept)
+    np.testing.assert_array_equal(thinned.normals, normals[kept])
+
+
 # --- covariance -------------------------------------------------------------------------------------------------------
+
+
+def test_block_covariance_is_that_of_leaving_out_one_block_at_a_time() -> None:
+    before, after = (Surface.of(fused(points).xyz[::4], NormalParams(radius_m=2.0)) for points in two_epochs(0))
+    level = icp._Level.of(before, after, 0.75, IcpParams(), NormalParams())
+    pairs = level.pair(np.eye(4))
+    p = before.xyz - after.centre
+    n = after.normals.astype(float)[pairs.match]
+    J, is_pair = np.hstack([n, np.cross(p, n)]), pairs.weight > 0
+    block = np.floor(p[:, :2] / 10.0)
+    steps = []
+    for own in np.unique(block[is_pair], axis=0):
+        w = pairs.weight * np.any(block != own, axis=1)
+        steps.append(-np.linalg.solve(J.T @ (w[:, None] * J), J.T @ (w * pairs.residual)))
+    deviation = np.array(steps) - np.mean(steps, axis=0)
+    expected = (len(steps) - 1) / len(steps) * deviation.T @ deviation
+    assert len(steps) >= icp.MIN_BLOCKS
+    found = icp._block_covariance(level, pairs, np.eye(4), 10.0)
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-6 * expected.max())
 
 
 def independent_noise(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""One plane per ground cell by RANSAC."""
+"""One plane per ground cell by RANSAC, and the surface that blends the planes."""
 
 from __future__ import annotations
 
@@ -172,3 +172,47 @@ def _refined(xyz, a, b, h, gx, gy, inlier_m, prior):  # type: ignore[no-untyped-
     det = xx * yy - xy * xy
     gx, gy = (xz * yy - xy * yz) / det, (xx * yz - xy * xz) / det
     return mz - gx * mx - gy * my, gx, gy
+
+
+@njit(nogil=True, cache=True)
+def blended_height_range(
+    start: int,
+    stop: int,
+    xy: FloatArray,
+    cell_m: float,
+    first: Int64Array,
+    height: FloatArray,
+    slope: FloatArray,
+    result: FloatArray,
+) -> None:
+    """Height of points [start, stop): the planes of the four nearest cells, weighted bilinearly.
+
+    Parameters
+    ----------
+    xy : (n, 2) float64, m
+    cell_m : float, m
+        Edge of a cell.
+    first : (2,) int64
+        Cell of the first row and column.
+    height, slope : (nx, ny) float64, m, and (nx, ny, 2) float64
+        Plane of each cell: height at its centre, NaN where there is none, and rise per metre along x and y.
+    result : (n,) float64, m
+        Filled with the heights; NaN where none of the four cells has a plane.
+    """
+    for p in range(start, stop):
+        x = xy[p, 0] / cell_m - 0.5 - first[0]
+        y = xy[p, 1] / cell_m - 0.5 - first[1]
+        base_x, base_y = np.floor(x), np.floor(y)
+        total = weight = 0.0
+        for corner in range(4):
+            step_x, step_y = corner // 2, corner % 2
+            i, j = int(base_x) + step_x, int(base_y) + step_y
+            if i < 0 or i >= height.shape[0] or j < 0 or j >= height.shape[1]:
+                continue
+            away_x, away_y = x - base_x - step_x, y - base_y - step_y
+            plane = height[i, j] + (slope[i, j, 0] * (away_x * cell_m) + slope[i, j, 1] * (away_y * cell_m))
+            w = (1.0 - abs(away_x)) * (1.0 - abs(away_y))
+            if w > 0.0 and np.isfinite(plane):
+                total += w * plane
+                weight += w
+        result[p] = total / weight if weight > 1e-9 else np.nan

@@ -1,4 +1,4 @@
-"""Rasters of the ground: cells of points, what is lowest in each, gaps relaxed, heights between cell centres."""
+"""Rasters of the ground: cells of points, what is lowest in each, and gaps relaxed."""
 
 from __future__ import annotations
 
@@ -77,28 +77,3 @@ def relax(height, is_known, sweeps):  # type: ignore[no-untyped-def]
                     out[j] = (east[j] + west[j] + row[min(j + 1, n_y - 1)] + row[max(j - 1, 0)]) / 4
         old, new = new, old
     return old
-
-
-@njit(nogil=True, cache=True)
-def height_range(start, stop, xy, cell_m, first, height, slope, result):  # type: ignore[no-untyped-def]
-    """Heights at plan positions [start, stop) of (k, 2), blended between the planes of the four cells around each.
-
-    ``height`` (nx, ny) and ``slope`` (nx, ny, 2) are those of `GroundModel`; ``result`` (k,) is NaN where none is near.
-    """
-    n_x, n_y = height.shape
-    for p in range(start, stop):
-        x, y = xy[p, 0] / cell_m - 0.5 - first[0], xy[p, 1] / cell_m - 0.5 - first[1]
-        low_i, low_j = np.floor(x), np.floor(y)
-        x, y = x - low_i, y - low_j
-        total = weight = 0.0
-        for di in range(2):
-            for dj in range(2):
-                i, j = int(low_i) + di, int(low_j) + dj
-                if i < 0 or i >= n_x or j < 0 or j >= n_y:
-                    continue
-                plane = height[i, j] + (slope[i, j, 0] * ((x - di) * cell_m) + slope[i, j, 1] * ((y - dj) * cell_m))
-                w = (1.0 - abs(x - di)) * (1.0 - abs(y - dj))
-                if w > 0.0 and np.isfinite(plane):
-                    total += w * plane
-                    weight += w
-        result[p] = total / weight if weight > 1e-9 else np.nan

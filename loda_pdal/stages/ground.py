@@ -14,11 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from loda_pdal.kernels.ground_planes import fit_planes
+from loda_pdal.kernels.ground_planes import blended_height_range, fit_planes
 from loda_pdal.kernels.ground_raster import (
     cell_range,
     group_by_cell,
-    height_range,
     lower_to,
     relax,
     sort_range,
@@ -84,20 +83,12 @@ class GroundModel:
 
     def height_at(self, xy: FloatArray) -> FloatArray:
         """Ground height (k,) m at plan positions (k, 2) m; NaN where there is none. Continuous where defined."""
-        if self.height.size == 0 or len(xy) == 0:
-            return np.full(len(xy), np.nan)
-        result = np.empty(len(xy))
+        found = np.full(len(xy), np.nan)
+        planes = np.ascontiguousarray(self.height), np.ascontiguousarray(self.slope)
         run_ranges(
-            height_range,
-            len(xy),
-            np.ascontiguousarray(xy),
-            float(self.cell_m),
-            self.first,
-            self.height,
-            self.slope,
-            result,
+            blended_height_range, len(xy), np.ascontiguousarray(xy), float(self.cell_m), self.first, *planes, found
         )
-        return result
+        return found
 
 
 def ground_model(xyz: FloatArray, n_raw: IntArray, params: GroundParams) -> GroundModel:

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from loda_pdal.kernels.shifted import find_shifted, spread
 from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array, IntArray
 from loda_pdal.model.groups import consecutive
 from loda_pdal.params import ProxyParams
@@ -88,8 +89,8 @@ def voxel_components(cells: Int64Array, closing_voxels: int, min_voxels: int) ->
     if len(cells) == 0:
         return np.zeros(0, dtype=np.int32)
     margin = closing_voxels + 1
-    low = cells.min(axis=0) - margin
-    span = cells.max(axis=0) - low + margin + 1
+    low = np.array([column.min() for column in cells.T]) - margin
+    span = np.array([column.max() for column in cells.T]) - low + margin + 1
     strides = np.array([span[1] * span[2], span[2], 1], dtype=np.int64)
     key = (cells - low) @ strides
     closed = _closed(_distinct(key), strides, closing_voxels)
@@ -103,10 +104,10 @@ def _closed(keys: Int64Array, strides: Int64Array, steps: int) -> Int64Array:
     """Sorted keys after ``steps`` dilations and as many erosions; the cube is taken apart into its three axes."""
     for _ in range(steps):
         for stride in strides:
-            keys = _distinct(np.concatenate([keys - stride, keys, keys + stride]))
+            keys = spread(keys, stride)
     for _ in range(steps):
         for stride in strides:
-            keys = keys[_is_in(keys - stride, keys) & _is_in(keys + stride, keys)]
+            keys = keys[(find_shifted(keys, -stride) >= 0) & (find_shifted(keys, stride) >= 0)]
     return keys
 
 
@@ -116,20 +117,13 @@ def _distinct(keys: Int64Array) -> Int64Array:
     return np.asarray(ordered[np.concatenate([[True], ordered[1:] != ordered[:-1]])])
 
 
-def _is_in(wanted: Int64Array, keys: Int64Array) -> BoolArray:
-    """Which of the ascending ``wanted`` occur in the ascending ``keys``."""
-    return np.asarray(keys[np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)] == wanted)
-
-
 def _connected(keys: Int64Array, strides: Int64Array) -> IntArray:
     """Connected piece of each of the sorted keys, over faces, edges and corners, numbered by its lowest key."""
     own, other = [], []
     for offset in _HALF_OF_26:
-        wanted = keys + int(np.dot(offset, strides))
-        place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-        is_joined = keys[place] == wanted
-        own.append(np.flatnonzero(is_joined))
-        other.append(place[is_joined])
+        place = find_shifted(keys, np.dot(offset, strides))
+        own.append(np.flatnonzero(place >= 0).astype(np.int32))
+        other.append(place[own[-1]])
     edges = (np.concatenate(own), np.concatenate(other))
     graph = coo_array((np.ones(len(edges[0]), dtype=np.int8), edges), shape=(len(keys), len(keys)))
     return consecutive(connected_components(graph, directed=False)[1])[0]
