@@ -33,7 +33,7 @@ from loda_pdal.model.lod_grid import LodGrid
 from loda_pdal.model.pair import Pair
 from loda_pdal.model.registration import Registration
 from loda_pdal.params import FeatureParams, FuseParams, LodParams, OutlierParams, Parameters
-from loda_pdal.stages import features, fuse, instances, lod, outliers, proxies, registration
+from loda_pdal.stages import features, fuse, lod, outliers, proxies, registration
 
 Exchange = dict[Callable[..., Any], Callable[..., Any]]
 
@@ -113,7 +113,7 @@ def exchanged(threads: int) -> Exchange:
         neighbours.nearest: nearest,
         neighbours.count_neighbours: count_neighbours,
         clusters.linked: linked,
-        instances.dbscan: dbscan,
+        clusters.dbscan: dbscan,
         proxies.voxel_components: voxel_components,
     }
 

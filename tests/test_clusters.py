@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from loda_pdal.kernels.clusters import components, count_some, dbscan, smooth_pieces
+from loda_pdal.kernels.clusters import components, count_until, dbscan, smooth_pieces
 from loda_pdal.kernels.contacts import contact_keys
 
 
@@ -54,7 +54,7 @@ def test_contacts_are_counted_one_by_one(seed: int, n: int) -> None:
 def test_counting_stops_behind_enough(seed: int, n: int, enough: int) -> None:
     xyz = np.random.default_rng(seed).uniform(0, 2, (n, 3))
     counts = np.sum(np.linalg.norm(xyz[:, None] - xyz[None], axis=2) <= 0.7, axis=1)
-    found = count_some(xyz, 0.7, enough)
+    found = count_until(xyz, 0.7, enough)
     assert np.array_equal(np.minimum(found, enough), np.minimum(counts, enough))
     assert (found <= counts).all()
 

@@ -150,8 +150,6 @@ def test_height_is_the_bilinear_mean_of_the_planes_around() -> None:
     np.testing.assert_allclose(model.height_at(xy), expected, rtol=0, atol=1e-12)
 
 
-<<<<<<< HEAD
-=======
 def test_points_are_sorted_by_cell_and_then_by_place() -> None:
     rng = np.random.default_rng(2)
     xyz = rng.integers(0, 4, (3000, 3)).astype(float)  # many equal coordinates
@@ -175,7 +173,6 @@ def test_gaps_relax_towards_their_neighbours(shape: tuple[int, int]) -> None:
     np.testing.assert_allclose(relax(height.copy(), is_known, 5), expected, rtol=0, atol=1e-14)
 
 
->>>>>>> w-c
 def test_objects_cut_out_of_their_scene_have_no_ground() -> None:
     rng = np.random.default_rng(8)
     feet = [(4.0 * i, 5.0 * j) for i in range(6) for j in range(6)]

@@ -71,7 +71,7 @@ def dbscan(xyz: npt.NDArray[Any], weight: IntArray, radius: float, least_weight:
     return cluster
 
 
-def count_some(xyz: npt.NDArray[Any], radius: float, enough: int) -> IntArray:
+def count_until(xyz: npt.NDArray[Any], radius: float, enough: int) -> IntArray:
     """How many points of a cloud (n, 3) lie within ``radius``, m, of each of its points, itself included, (n,) int32.
 
     Counting stops somewhere behind ``enough``.

@@ -92,11 +92,11 @@ def quantile_range(
             n += not np.isnan(picked[n])
         if n == 0:
             continue
-        place = q * (n - 1)
-        low = int(np.floor(place))
+        place = starts[group] + q * (n - 1)  # as if all groups stood sorted behind each other
+        part = place - np.floor(place)
+        low = int(np.floor(place)) - starts[group]
         lower = _select(picked, n, low)
         upper = lower if low + 1 == n else np.min(picked[low + 1 : n])
-        part = place - low
         quantile[group] = lower * (1 - part) + upper * part
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from loda_pdal.kernels.clusters import components, count_some, dbscan, linked
+from loda_pdal.kernels.clusters import components, count_until, dbscan, linked
 from loda_pdal.kernels.neighbours import nearest
 from loda_pdal.kernels.parallel import run_ranges
 from loda_pdal.kernels.rasters import highest_range
@@ -286,8 +286,8 @@ def _vegetation(
     points = xyz[members]
     if params.is_density_adaptive:
         sphere_m3 = 4.0 / 3.0 * np.pi
-        dense = sphere_m3 * (params.cluster_density_factor / params.cluster_radius_m) ** 3  # more need no longer reach
-        density = count_some(points, 1.0, int(dense) + 1) / sphere_m3
+        enough = sphere_m3 * (params.cluster_density_factor / params.cluster_radius_m) ** 3  # for the least reach
+        density = count_until(points, 1.0, int(enough) + 1) / sphere_m3
         reach = np.maximum(params.cluster_radius_m, params.cluster_density_factor / np.cbrt(density))
         cluster = euclidean_clusters(points, params.cluster_radius_m, reach)
     else:

@@ -34,10 +34,10 @@ class Coverage:
 
     def at(self, xyz: FloatArray) -> BoolArray:
         """Whether each point (k, 3) m lies in a column that the survey saw, (k,) bool."""
-        cell = np.floor(xyz[:, :2] / self.cell_m).astype(np.int64) - self.low
-        is_inside = np.all((cell >= 0) & (cell < self.is_seen.shape), axis=1)
+        i, j = (np.floor(xyz[:, axis] / self.cell_m).astype(np.int64) - self.low[axis] for axis in range(2))
+        is_inside = (i >= 0) & (i < self.is_seen.shape[0]) & (j >= 0) & (j < self.is_seen.shape[1])
         seen = np.zeros(len(xyz), np.bool_)
-        seen[is_inside] = self.is_seen[cell[is_inside, 0], cell[is_inside, 1]]
+        seen[is_inside] = self.is_seen[i[is_inside], j[is_inside]]
         return seen
 
 
