@@ -419,6 +419,9 @@ class ChangeParams(StageParams):
         low=0,
         high=1000,
     )
+    volume_sigmas: float = param(
+        0.0, "gained less lost voxels must exceed this many times the root of their sum; 0: need not", low=0, high=100
+    )
     replaced_m: float = param(
         0.15,
         "difference of the tops that makes a parked vehicle another one, where its surface moved by half of that; "
@@ -700,6 +703,8 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "query_radius_m": 1.2,
             "min_samples": 20,
             "min_expected_points": 0.0,
+            "volume_sigmas": 3.0,
+            "vegetation_height_m": 0.8,
             "fills_buildings": True,
         },
         "observability": {"cell_m": 2.0},

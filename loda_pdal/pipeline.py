@@ -253,8 +253,8 @@ def _bodies(xyz: FloatArray, ground: Ground, instances: Instances, p: Parameters
     points, instance = xyz[member], instances.instance[member]
     if not p.changes.fills_buildings:
         return points, instance
-    is_building = instances.classification == ObjectClass.BUILDING
-    filling = fill_columns(xyz, ground.height, instances.instance - 1, is_building, p.changes.voxel_m)
+    is_body = np.isin(instances.classification, (ObjectClass.BUILDING, ObjectClass.OTHER))
+    filling = fill_columns(xyz, ground.height, instances.instance - 1, is_body, p.changes.voxel_m)
     return np.concatenate([points, filling.xyz]), np.concatenate([instance, instances.instance[filling.under]])
 
 
@@ -276,7 +276,8 @@ def label_objects(
 
     surfaces = at_once(surface, clouds, ground, segments, instances, owner)
     if p.changes.fills_buildings:
-        surfaces = surfaces.join(instances, lambda side, i: filled(side, i.classification == ObjectClass.BUILDING, p))
+        is_body = np.append(objects.object_class == ObjectClass.BUILDING, False)
+        surfaces = surfaces.map(lambda side: filled(side, is_body[side.owner], p))
     covered = at_once(lambda cloud: coverage(cloud.xyz, p.observability), clouds)
     changes = decide_changes(surfaces, objects.object_class, covered, lod, p.changes, p.observability, p.confidence)
     return replace(changes, owner=changes.owner.join(clouds, lambda own, cloud: own[: len(cloud)]))

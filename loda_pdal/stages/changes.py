@@ -341,6 +341,8 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
     is_lowered = least == 0 or cue.lost_above >= least_above or cue.column_rise < -height_m / 2
     rises = has_height and cue.dh > 0 and is_raised
     sinks = has_height and cue.dh < 0 and is_lowered
+    noise = params.volume_sigmas * math.sqrt(cue.gained + cue.lost)
+    has_volume = has_volume and abs(cue.gained - cue.lost) >= noise
     swells = has_volume and cue.dv_ratio > 0 and (least == 0 or cue.gained >= max(least, cue.lost))
     shrinks = has_volume and cue.dv_ratio < 0 and (least == 0 or cue.lost >= max(least, cue.gained))
     figures = _figures(cue, height_m, ratio, gate)
