@@ -34,7 +34,7 @@ plugin: venv  ## the QGIS plugin as a zip in dist, with the parameters of this e
 	@$(BIN)/python qgis_plugin/package.py
 
 clean:  ## remove everything that make has made, except .venv, .pdal and .qgis
-	rm -rf demo build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf demo build dist .mypy_cache .ruff_cache */.ruff_cache */*/.ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -not -path './.venv/*' -not -path './.qgis/*' -prune -exec rm -rf {} +
 
 venv:

@@ -38,14 +38,14 @@ def threads(request: pytest.FixtureRequest) -> int:
 
 
 @pytest.fixture(scope="session")
-def block(request: pytest.FixtureRequest) -> Path:
+def block(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of the simulated block: before.laz, after.laz and truth.json, one point per 0.25 m voxel."""
     from loda_pdal.benchmark.profile import prepared_block
     from loda_pdal.kernels import is_cache_warm
     from loda_pdal.warmup import compile_kernels
 
     if not is_cache_warm():
-        compile_kernels()
+        compile_kernels(tmp_path_factory.mktemp("warmup"))
     return prepared_block(request.config.getoption("--blocks"), 1.6 if request.config.getoption("--big") else 0.4)
 
 

@@ -6,6 +6,7 @@ that all do the same.
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 import jakteristics
@@ -20,6 +21,7 @@ from scipy.spatial import cKDTree
 from loda_pdal.model.transform import IDENTITY
 from loda_pdal.params import FeatureParams, IcpParams, LodParams, NormalParams, OutlierParams
 
+logging.getLogger("py4dgeo").handlers.clear()  # they would leave a log file wherever one is
 registration = o3d.pipelines.registration
 
 

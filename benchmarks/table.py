@@ -16,7 +16,7 @@ def tables(result: dict[str, Any]) -> str:
     machine = result["machine_info"]
     cpu = f"{machine['cpu'].get('brand_raw', machine['processor'])}, {machine['cpu']['count']} processors"
     said = f"{cpu}; Python {machine['python_version']}; {result['datetime'][:10]}."
-    return "\n\n".join([measurements(result), stages(result), said])
+    return "\n\n".join([measurements(result), *stages(result), said])
 
 
 def measurements(result: dict[str, Any]) -> str:
@@ -43,12 +43,14 @@ def measurements(result: dict[str, Any]) -> str:
     return markdown(HEADER, rows)
 
 
-def stages(result: dict[str, Any]) -> str:
-    """Seconds of each stage of the whole method, a column for each way to run it."""
+def stages(result: dict[str, Any]) -> list[str]:
+    """Seconds of each stage of the whole method, a column for each way to run it; no table where it was not run."""
     runs = {one["extra_info"]["library"]: one["extra_info"].get("stages") for one in result["benchmarks"]}
     known = {library: seconds for library, seconds in runs.items() if seconds}
     names = dict.fromkeys(name for seconds in known.values() for name in seconds)
-    return markdown(["stage (s)", *known], [[name, *(f"{s[name]:.2f}" for s in known.values())] for name in names])
+    return [
+        markdown(["stage (s)", *known], [[name, *(f"{s[name]:.2f}" for s in known.values())] for name in names])
+    ] * bool(known)
 
 
 def markdown(header: list[str], rows: list[list[str]]) -> str:

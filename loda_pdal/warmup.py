@@ -1,7 +1,7 @@
 """Compiling every kernel once, before the first survey is waited for.
 
-The method is run on a scene of a few thousand points that sends something through every kernel, with every preset; what
-gets compiled on the way is kept in the cache folder of `loda_pdal.kernels`, for all processes to come.
+A small scene that sends something through every kernel is read, searched for changes with every preset, and a result is
+written. What gets compiled on the way is kept in the cache folder of `loda_pdal.kernels`, for all processes to come.
 """
 
 from __future__ import annotations
@@ -10,17 +10,21 @@ import logging
 import pkgutil
 import time
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NamedTuple
 
+import laspy
 import numpy as np
 from numba.core import event
 from numba.core.dispatcher import Dispatcher
+from pyproj import CRS
 
 import loda_pdal.kernels
+from loda_pdal.io.las import read_epochs
+from loda_pdal.io.outputs import write_outputs
 from loda_pdal.kernels import mark_cache_warm
-from loda_pdal.model.cloud import FloatArray, to_local_grid
+from loda_pdal.model.cloud import FloatArray
 from loda_pdal.model.pair import Pair
-from loda_pdal.model.survey import Survey
 from loda_pdal.params import PRESETS, Parameters
 from loda_pdal.pipeline import Progress, detect_changes
 
@@ -28,6 +32,9 @@ logger = logging.getLogger(__name__)
 
 COMPILING = "compiling kernels, once"
 """What progress says meanwhile."""
+
+EPSG, PLACE = 28992, np.array([121_000.0, 487_000.0, 0.0])
+"""Where the scene is said to be."""
 
 SIMULATION = frozenset({"loda_pdal.kernels.rays"})
 """Kernels that only the simulator of benchmarks runs; it compiles them itself."""
@@ -40,18 +47,22 @@ class Compiled(NamedTuple):
     seconds: float
 
 
-def compile_kernels(progress: Progress | None = None) -> Compiled:
-    """Compile what is not in the cache folder yet, and mark the folder as complete (`is_cache_warm`).
+def compile_kernels(folder: Path, progress: Progress | None = None) -> Compiled:
+    """Compile what is not in the cache folder yet, and mark that as complete (`is_cache_warm`).
 
     Parameters
     ----------
+    folder : Path
+        Where a small run may leave its files.
     progress : callable, optional
         ``progress(done, total, text)``, called whenever a kernel has been compiled.
     """
-    start, surveys = time.perf_counter(), small_scene()
+    start = time.perf_counter()
     with event.install_listener("numba:compile", _Count(progress)) as count:
+        surveys = read_epochs(*write_scene(folder))
         for preset in PRESETS:
-            detect_changes(surveys.before, surveys.after, Parameters.preset(preset))
+            result = detect_changes(surveys.before, surveys.after, Parameters.preset(preset))
+        write_outputs(result, surveys, folder / "result", overwrite=True)
     mark_cache_warm()
     return Compiled(len(count.compiled), time.perf_counter() - start)
 
@@ -77,45 +88,57 @@ class _Count(event.Listener):  # type: ignore[misc]
         self.compiled: set[str] = set()
         self._ours = {_name(kernel) for kernel in kernels()}
         self._progress = progress or (lambda done, total, text: None)
-        self._seconds: list[float] = []
+        self._begun: list[float] = []
+        self._in_callees = [0.0]
 
     def on_start(self, event: Any) -> None:
         """A kernel is to be compiled, maybe amid one that calls it."""
-        self._seconds.append(-time.thread_time())
+        self._begun.append(time.thread_time())
+        self._in_callees.append(0.0)
 
     def on_end(self, event: Any) -> None:
         """It is."""
-        seconds = self._seconds.pop() + time.thread_time()
-        if self._seconds:  # the caller's own time is what remains
-            self._seconds[-1] -= seconds
+        seconds = time.thread_time() - self._begun.pop()
+        own = seconds - self._in_callees.pop()
+        self._in_callees[-1] += seconds
         kernel = event.data["dispatcher"]
-        logger.debug("%5.2f s  %s(%s)", seconds, _name(kernel), ", ".join(map(str, event.data["args"])))
+        logger.debug("%5.2f s  %s(%s)", own, _name(kernel), ", ".join(map(str, event.data["args"])))
         if _name(kernel) in self._ours - self.compiled:
             self.compiled.add(_name(kernel))
             self._progress(len(self.compiled), len(self._ours), COMPILING)
 
 
-def small_scene() -> Pair[Survey]:
-    """Two surveys of 24 x 24 m with a house that gets a storey, a tree, and a car that leaves; the same every time."""
+def write_scene(folder: Path) -> Pair[Path]:
+    """Two surveys of 24 x 24 m in files: a house that gets a storey, a tree, and a car that leaves. The same every
+    time."""
     random = np.random.default_rng(0)
     ground = _box(random, (0, 0, 0), (24, 24, 0), 16000)
     house, storey = _box(random, (2, 3, 0), (10, 9, 4), 9000), _box(random, (2, 3, 4), (6, 9, 7), 4000)
     tree = random.normal((18, 18, 4), 0.8, (2500, 3))
     pole = _box(random, (14, 6, 0), (14.1, 6.1, 4), 300)
     car = _box(random, (15, 12, 0.3), (19, 13.8, 1.6), 1500)
-
-    def survey(*parts: FloatArray) -> Survey:
+    scene = Pair([ground, house, tree, pole, car], [ground, house, storey, tree, pole])
+    paths = Pair(folder / "before.laz", folder / "after.laz")
+    for path, parts in zip(paths, scene, strict=True):
         xyz = np.concatenate(parts)
-        return Survey(to_local_grid(xyz + random.normal(0, 0.01, xyz.shape)))
-
-    return Pair(survey(ground, house, tree, pole, car), survey(ground, house, storey, tree, pole))
+        _write_laz(path, xyz + random.normal(0, 0.01, xyz.shape) + PLACE)
+    return paths
 
 
 def _box(random: np.random.Generator, low: tuple[float, ...], high: tuple[float, ...], n: int) -> FloatArray:
-    """About ``n`` points (m, 3) on the faces of a box that can be seen: all but the lower one."""
+    """``n`` points (n, 3) on the faces of a box that can be seen: all but the lower one."""
     at = random.random((n, 3))
     size = np.subtract(high, low)
     areas = np.array([size[1] * size[2], size[0] * size[2], size[0] * size[1] / 2])
     face = random.choice(3, n, p=areas / areas.sum())
     at[np.arange(n), face] = np.where(face == 2, 1.0, np.round(at[np.arange(n), face]))
     return np.asarray(low + at * size)
+
+
+def _write_laz(path: Path, xyz: FloatArray) -> None:
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales, header.offsets = np.full(3, 0.001), PLACE
+    header.add_crs(CRS.from_epsg(EPSG))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = xyz.T
+    las.write(str(path))

@@ -19,7 +19,7 @@ if_possible=0
 [ "${1:-}" = --if-possible ] && if_possible=1
 
 has_qgis() { "$1" -c 'import qgis.core, sys; sys.exit(qgis.core.Qgis.QGIS_VERSION_INT < 33400)' 2>/dev/null; }
-has_all() { has_qgis "$python" && command -v qgis_process >/dev/null && { [ "${CI:-}" != true ] || command -v Xvfb >/dev/null; }; }
+has_all() { has_qgis "$python" && command -v qgis_process >/dev/null; }
 
 install_packages() {
   [ "$(. /etc/os-release 2>/dev/null && echo "${ID:-}${VERSION_ID:-}")" = debian12 ] ||
@@ -37,7 +37,7 @@ install_packages() {
   export DEBIAN_FRONTEND=noninteractive
   apt-get -qq -o DPkg::Lock::Timeout=300 update >/dev/null || give_up "the package lists cannot be fetched."
   apt-get -qq -o DPkg::Lock::Timeout=300 install -y --no-install-recommends -t bookworm-backports \
-    qgis python3-qgis qgis-providers xvfb xauth python3-venv >/dev/null || give_up "the packages cannot be installed."
+    qgis python3-qgis qgis-providers python3-venv >/dev/null || give_up "the packages cannot be installed."
 }
 
 make_environment() {

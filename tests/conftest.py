@@ -36,13 +36,13 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 @pytest.fixture(scope="session")
-def compiled_kernels() -> None:
+def compiled_kernels(tmp_path_factory: pytest.TempPathFactory) -> None:
     """For tests of what a run says or how long it takes: with a cold cache it would compile first."""
     from loda_pdal.kernels import is_cache_warm
     from loda_pdal.warmup import compile_kernels
 
     if not is_cache_warm():
-        compile_kernels()
+        compile_kernels(tmp_path_factory.mktemp("warmup"))
 
 
 @pytest.fixture(scope="session")

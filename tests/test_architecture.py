@@ -20,7 +20,7 @@ MAY_IMPORT = {
     "io": {"io", "kernels", "model", "params"},
     "assembly": {"stages", "model"},
     "pipeline": {"assembly", "stages", "kernels", "model", "params"},
-    "warmup": {"pipeline", "kernels", "model", "params"},
+    "warmup": {"pipeline", "kernels", "io", "model", "params"},
     "pdal_face": {"pdal_face", "pipeline", "assembly", "stages", "kernels", "io", "model", "params"},
     "benchmark": {"benchmark", "warmup", "pipeline", "stages", "kernels", "io", "model", "params"},
     "cli": {"cli", "benchmark", "pdal_face", "warmup", "pipeline", "kernels", "io", "model", "params"},

@@ -19,7 +19,7 @@ from pyproj import CRS
 
 from loda_pdal.io.colours import LABEL_COLOURS, rgb
 from loda_pdal.io.geopackage import run_rows, to_map_polygons, write_geopackage
-from loda_pdal.io.qml import label_style
+from loda_pdal.io.qml import change_style
 from loda_pdal.io.qml_review import ALIASES
 from loda_pdal.model.frame import LocalFrame
 from loda_pdal.model.labels import ChangeLabel
@@ -237,25 +237,26 @@ def test_every_layer_with_geometry_has_one_default_style(package: Path) -> None:
 
 
 def test_styles_give_every_label_the_colour_of_the_one_table(package: Path) -> None:
-    qml = rows(package, "SELECT styleQML FROM layer_styles WHERE f_table_name = 'changes'")[0][0]
-    root = ET.fromstring(qml)
-    renderer = root.find("renderer-v2")
-    assert renderer is not None and renderer.get("attr") == "label"
-    symbols = {symbol.get("name"): symbol for symbol in renderer.findall("symbols/symbol")}
-    categories = {c.get("value"): symbols[c.get("symbol")] for c in renderer.findall("categories/category")}
-    assert set(categories) == {label.title for label in ChangeLabel}
-    for label in ChangeLabel:
-        colours = {o.get("value", "").rsplit(",", 1)[0] for o in categories[label.title].iter("Option")}
-        assert ",".join(map(str, rgb(LABEL_COLOURS[label]))) in colours, label
-    kinds = {title: [layer.get("class") for layer in symbol.findall("layer")] for title, symbol in categories.items()}
-    assert kinds["Undetermined"] == ["LinePatternFill", "SimpleLine"]
-    assert kinds["Unchanged"] == ["SimpleLine"]
-    assert kinds["Added"] == ["SimpleFill"]
-    assert "confidence" in qml and "confidence" not in label_style(opacity_by_confidence=False)
+    qml = dict(rows(package, "SELECT f_table_name, styleQML FROM layer_styles"))
+    for layer, labels in (("changes", set(ChangeLabel) - {ChangeLabel.UNCHANGED}), ("objects", set(ChangeLabel))):
+        renderer = ET.fromstring(qml[layer]).find("renderer-v2")
+        assert renderer is not None and renderer.get("attr") == "label"
+        symbols = {symbol.get("name"): symbol for symbol in renderer.findall("symbols/symbol")}
+        categories = {c.get("value"): symbols[c.get("symbol")] for c in renderer.findall("categories/category")}
+        assert set(categories) == {label.title for label in labels}
+        for label in labels:
+            colours = {o.get("value", "").rsplit(",", 1)[0] for o in categories[label.title].iter("Option")}
+            assert ",".join(map(str, rgb(LABEL_COLOURS[label]))) in colours, label
+        kinds = {title: [part.get("class") for part in symbol.findall("layer")] for title, symbol in categories.items()}
+        assert kinds["Undetermined"] == ["LinePatternFill", "SimpleLine"] and kinds["Added"] == ["SimpleFill"]
+        assert kinds.get("Unchanged", ["SimpleLine"]) == ["SimpleLine"]
+    assert "confidence" in qml["changes"] and "confidence" not in qml["objects"]
 
 
 def test_the_form_names_every_column_once() -> None:
     assert sorted([*ALIASES, "label_code"]) == sorted(OBJECT_COLUMNS)
+    fields = ET.fromstring(change_style()).iter("attributeEditorField")
+    assert sorted(field.get("name", "") for field in fields) == sorted(ALIASES)
 
 
 def test_all_styles_are_well_formed(package: Path) -> None:

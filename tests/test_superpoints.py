@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from reference.partition import edges_of, energy, graph_of, least_energy
+from reference.partition import cut_pursuit, edges_of, energy, graph_of, least_energy, quantised
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from loda_pdal.benchmark.simulate import SimulationOptions, simulate_block
 from loda_pdal.kernels import partition as kernels
 from loda_pdal.kernels.parallel import set_threads
-from loda_pdal.params import FeatureParams, SuperpointParams
+from loda_pdal.model.cloud import to_local_grid
+from loda_pdal.params import FeatureParams, FuseParams, SuperpointParams
+from loda_pdal.stages import partition
 from loda_pdal.stages.features import Features, eigen_features
-from loda_pdal.stages.partition import Graph, minimise_energy, quantised, regrouped, single_voxels
+from loda_pdal.stages.fuse import fuse_points
+from loda_pdal.stages.partition import Graph, minimise_energy, regrouped, single_voxels
 from loda_pdal.stages.superpoints import absorb_small, standardised, superpoints, voxel_graph
 
 PARAMS = SuperpointParams()
@@ -46,6 +51,19 @@ def scene(seed: int = 0) -> tuple[np.ndarray, Features, np.ndarray]:
     return xyz[order], eigen_features(xyz[order], xyz[order, 2], FeatureParams()), truth[order]
 
 
+@pytest.fixture(scope="module")
+def street() -> list[np.ndarray]:
+    """Raw points (n, 3) of both surveys of a short simulated street."""
+    block = simulate_block(3, SimulationOptions(length_m=30.0, width_m=40.0, density=0.25, lanes=(0.0,)))
+    return [to_local_grid(side.xyz) for side in block.surveys]
+
+
+def fused(raw: np.ndarray) -> tuple[np.ndarray, Features]:
+    """Fused points of a survey and their features, with heights above the lowest point."""
+    xyz = fuse_points(raw, FuseParams()).xyz
+    return xyz, eigen_features(xyz, xyz[:, 2] - xyz[:, 2].min(), FeatureParams())
+
+
 def is_connected_partition(graph: Graph, labels: np.ndarray) -> bool:
     edges, _ = edges_of(*graph)
     inside = edges[labels[edges[:, 0]] == labels[edges[:, 1]]]
@@ -71,6 +89,38 @@ def test_small_problems_are_nearly_always_solved_exactly(beta: float, least_solv
     assert min(excess) > -1e-12
     assert np.count_nonzero(np.array(excess) < 1e-9) >= least_solved
     assert max(excess) < largest_excess
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_energy_of_a_scene_is_at_most_that_of_cut_pursuit(seed: int) -> None:
+    xyz, features, _ = scene(seed)
+    standard = standardised(features)
+    graph = voxel_graph(xyz, standard, PARAMS)
+    edges, weights = edges_of(*graph)
+    by_cuts = energy(cut_pursuit(standard, edges, weights), standard, edges, weights)
+    assert minimise_energy(graph, standard).regions.energy <= by_cuts
+
+
+def test_the_energy_of_a_simulated_street_is_at_most_that_of_cut_pursuit(street: list[np.ndarray]) -> None:
+    for raw in street:
+        xyz, features = fused(raw)
+        piece = slice(3000)  # a strip across the street
+        standard = standardised(Features(features.values[piece], features.normals[piece], features.is_valid[piece]))
+        graph = voxel_graph(xyz[piece], standard, PARAMS)
+        edges, weights = edges_of(*graph)
+        by_cuts = energy(cut_pursuit(standard, edges, weights), standard, edges, weights)
+        assert minimise_energy(graph, standard).regions.energy <= by_cuts
+
+
+def test_cut_pursuit_finds_the_minimum_where_one_cut_does() -> None:
+    """The reference itself: two halves of a chain, told apart by a weak edge, and noise that no cut should follow."""
+    rng = np.random.default_rng(2)
+    features = quantised(np.repeat([0.0, 2.0], 4)[:, None] + rng.normal(0, 0.1, (8, 5)))
+    edges = np.column_stack([np.arange(7), np.arange(1, 8)])
+    weights = quantised(np.array([3.0, 3, 3, 0.5, 3, 3, 3])).astype(float)
+    labels = cut_pursuit(features, edges, weights)
+    assert labels.tolist() == [0, 0, 0, 0, 1, 1, 1, 1]
+    assert energy(labels, features, edges, weights) == pytest.approx(least_energy(features, edges, weights))
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(2, 120), st.floats(0.5, 6))
@@ -119,7 +169,7 @@ def test_tiles_side_by_side_have_the_energy_of_one_times_their_number() -> None:
 def test_contraction_is_a_matrix_product(seed: int, n: int, n_labels: int) -> None:
     graph, _ = random_problem(seed, n, 3 * n)
     labels = np.random.default_rng(seed).integers(0, n_labels, n).astype(np.int32)
-    first_arc, heads, weights = kernels.contract(*graph, labels, n_labels)
+    first_arc, heads, weights = kernels.contract(*graph, labels, np.empty(n_labels))
     tails = np.repeat(np.arange(n_labels), np.diff(first_arc))
     found = np.zeros((n_labels, n_labels))
     found[tails, heads] = weights
@@ -128,6 +178,74 @@ def test_contraction_is_a_matrix_product(seed: int, n: int, n_labels: int) -> No
     dense[np.repeat(np.arange(n), np.diff(graph.first_arc)), graph.heads] = graph.weights
     member = labels[:, None] == np.arange(n_labels)
     assert np.array_equal(found, np.where(np.eye(n_labels), 0, member.T @ dense @ member))
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(2, 60), st.integers(1, 20), st.booleans())
+def test_after_a_sweep_no_node_wants_to_move(seed: int, n: int, n_labels: int, opens_regions: bool) -> None:
+    graph, features = random_problem(seed, n, 3 * n)
+    rng = np.random.default_rng(seed)
+    group = kernels.connected_labels(graph.first_arc, graph.heads, rng.integers(0, 3, n).astype(np.int32))[0]
+    nodes = regrouped(single_voxels(graph, features), group, group.max() + 1, features)
+    used, labels = np.unique(rng.integers(0, n_labels, len(nodes)), return_inverse=True)
+    labels = labels.astype(np.int32)
+    medians = quantised(rng.normal(size=(len(nodes), 5)))
+    kernels.move_nodes(
+        *nodes.graph,
+        features,
+        nodes.order,
+        nodes.start,
+        nodes.medians,
+        nodes.deviations,
+        labels,
+        medians,
+        len(used),
+        1,
+        opens_regions,
+    )
+    for node in range(len(nodes)):
+        arcs = slice(nodes.graph.first_arc[node], nodes.graph.first_arc[node + 1])
+        inside = features[group == node].astype(float)
+
+        def cost(label: int, inside: np.ndarray = inside, arcs: slice = arcs) -> float:
+            shared = nodes.graph.weights[arcs][labels[nodes.graph.heads[arcs]] == label]
+            return float(np.abs(inside - medians[label]).sum() - shared.sum())
+
+        assert all(cost(labels[node]) <= cost(label) for label in labels[nodes.graph.heads[arcs]])
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(2, 120), st.floats(0.5, 6))
+def test_partners_that_are_kept_are_those_that_would_be_found_again(seed: int, n: int, degree: float) -> None:
+    graph, features = random_problem(seed, n, int(degree * n))
+
+    def find_all(*args: np.ndarray) -> None:
+        kernels.find_partners(*args[:6], np.ones_like(args[6]), *args[7:])
+
+    kept = minimise_energy(graph, features)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(partition, "find_partners", find_all)
+        assert np.array_equal(minimise_energy(graph, features).regions.labels, kept.regions.labels)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 80), st.integers(1, 4))
+def test_connected_labels_are_connected_components(seed: int, n: int, n_labels: int) -> None:
+    graph, _ = random_problem(seed, n, n)
+    labels = np.random.default_rng(seed).integers(0, n_labels, n).astype(np.int32)
+    edges, _ = edges_of(*graph)
+    inside = edges[labels[edges[:, 0]] == labels[edges[:, 1]]]
+    joined = coo_array((np.ones(len(inside)), inside.T), shape=(n, n))
+    expected = connected_components(joined, directed=False)  # numbered by the first node, as ours
+    found = kernels.connected_labels(graph.first_arc, graph.heads, labels)
+    assert found[1] == expected[0]
+    assert np.array_equal(found[0], expected[1])
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 300), st.booleans())
+def test_ranks_are_those_of_sorted_values(seed: int, n: int, has_ties: bool) -> None:
+    rng = np.random.default_rng(seed)
+    values = (rng.integers(0, 4, n) if has_ties else rng.exponential(size=n)).astype(np.float32)
+    rank = int(rng.integers(0, n))
+    bits = np.int32(kernels.rank_bits(values.view(np.int32), rank))
+    assert bits.view(np.float32) == np.sort(values)[rank]
 
 
 def test_the_graph_joins_nearest_neighbours_within_reach() -> None:
@@ -216,6 +334,16 @@ def test_superpoints_do_not_depend_on_place_or_threads() -> None:
         assert np.array_equal(superpoints(xyz, features, PARAMS).labels, expected.labels)
     finally:
         set_threads(None)
+
+
+def test_superpoints_of_two_surveys_at_once_in_any_order_of_the_points(street: list[np.ndarray]) -> None:
+    expected = [superpoints(*fused(raw), PARAMS) for raw in street]
+    shuffled = [np.random.default_rng(0).permutation(raw) for raw in street]
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(lambda raw: superpoints(*fused(raw), PARAMS), shuffled))
+    for one, other in zip(expected, found, strict=True):
+        assert np.array_equal(one.labels, other.labels)
+        assert (one.energy, one.n_absorbed) == (other.energy, other.n_absorbed)
 
 
 def test_standardised_features_have_no_mean_and_unit_spread() -> None:

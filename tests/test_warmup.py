@@ -28,8 +28,10 @@ print([(k.py_func.__name__, list(k.stats.cache_misses)) for k in kernels() if k.
 """
 
 CALLED = """
+import sys
+from pathlib import Path
 from loda_pdal.warmup import compile_kernels, kernels
-compile_kernels()
+compile_kernels(Path(sys.argv[1]))
 print([i for i, kernel in enumerate(kernels()) if kernel.signatures])
 """
 
@@ -62,10 +64,10 @@ def block(tmp_path_factory: pytest.TempPathFactory, compiled_kernels: None) -> P
     return folder
 
 
-def test_warmup_reaches_every_kernel() -> None:
-    """A kernel that fails here needs something in `small_scene` (or a preset) that makes the method call it."""
+def test_warmup_reaches_every_kernel(tmp_path: Path) -> None:
+    """A kernel that fails here needs something in `write_scene` (or a preset) that makes the method call it."""
     everything = kernels()
-    reached = with_callees(everything[i] for i in json.loads(said_by(CALLED)))
+    reached = with_callees(everything[i] for i in json.loads(said_by(CALLED, str(tmp_path))))
     assert [k.py_func.__name__ for k in everything if id(k) not in reached] == []
 
 
@@ -131,7 +133,7 @@ def test_the_first_run_shows_that_it_compiles(
     """With a cold cache; the compiling itself is left out here, its kernels are in this process already."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
 
-    def pretended(progress: Any) -> Compiled:
+    def pretended(folder: Path, progress: Any) -> Compiled:
         progress(1, 2, COMPILING)
         return Compiled(2, 30.0)
 
@@ -157,6 +159,7 @@ def test_progress_counts_the_kernels(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(warmup, "kernels", lambda: [fresh])
     monkeypatch.setattr(warmup, "detect_changes", lambda *_: (fresh(1), fresh(1.5)))
+    monkeypatch.setattr(warmup, "write_outputs", lambda *_, **__: None)
     said: list[tuple[int, int, str]] = []
-    done = compile_kernels(lambda *args: said.append(args))
+    done = compile_kernels(tmp_path, lambda *args: said.append(args))
     assert done.n == 1 and said == [(1, 1, COMPILING)] and is_cache_warm()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tempfile
 from pathlib import Path
 
 import click
@@ -187,4 +188,5 @@ def _compile_kernels() -> None:
 
     if not is_cache_warm():
         click.echo("Compiling kernels, once: that takes about half a minute.", err=True)
-        compile_kernels()
+        with tempfile.TemporaryDirectory(prefix="loda-pdal-") as scratch:
+            compile_kernels(Path(scratch))

@@ -84,7 +84,12 @@ class Profile:
     @property
     def exponent(self) -> float | None:
         """b in seconds = a * points^b, by least squares on the logarithms of the medians; None for one block."""
-        return slope_of([math.log(b.points) for b in self.blocks], [math.log(s) for s in self._seconds])
+        return self._growth_of(lambda run: run.total_s)
+
+    @property
+    def cpu_exponent(self) -> float | None:
+        """The same of processor time."""
+        return self._growth_of(lambda run: run.cpu_s)
 
     @property
     def gb_per_million(self) -> float | None:
@@ -92,13 +97,17 @@ class Profile:
         peaks = [block.median_of(lambda run: run.peak_gb) for block in self.blocks]
         return slope_of([block.points / 1e6 for block in self.blocks], peaks)
 
-    @property
-    def _seconds(self) -> list[float]:
-        return [block.median_of(lambda run: run.total_s) for block in self.blocks]
+    def _growth_of(self, value: Callable[[Run], float]) -> float | None:
+        sizes = [math.log(block.points) for block in self.blocks]
+        return slope_of(sizes, [math.log(block.median_of(value)) for block in self.blocks])
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain values."""
-        fits = {"exponent": self.exponent, "gb_per_million_points": self.gb_per_million}
+        fits = {
+            "exponent": self.exponent,
+            "cpu_exponent": self.cpu_exponent,
+            "gb_per_million_points": self.gb_per_million,
+        }
         return {"machine": self.machine, "fits": fits, "blocks": [asdict(block) for block in self.blocks]}
 
     def to_markdown(self) -> str:
@@ -106,13 +115,13 @@ class Profile:
         header = ["Block", "Pts (M)", "Inst", "R/S/M/C (s)", "read, write (s)", "Total (s)", "CPU (s)", "Peak (GB)"]
         lines = [markdown_table(header, [_row(block) for block in self.blocks]), ""]
         lines.append(
-            "Points are fused (0.25 m) and those of both epochs together, instances too. Medians of "
-            f"{min(len(block.runs) for block in self.blocks)} runs, each a process of its own from LAZ to all outputs."
+            "Points are fused (0.25 m) and those of both epochs together, instances too. Medians; runs per block: "
+            f"{min(len(block.runs) for block in self.blocks)}, each a process of its own from LAZ to all outputs."
         )
-        if self.exponent is not None and self.gb_per_million is not None:
+        if self.exponent is not None and self.cpu_exponent is not None and self.gb_per_million is not None:
             lines.append(
-                f"Total time grows with points^{self.exponent:.2f}, "
-                f"memory by {self.gb_per_million:.2f} GB per million points."
+                f"Total time grows with points^{self.exponent:.2f}, processor time with "
+                f"points^{self.cpu_exponent:.2f}, memory by {self.gb_per_million:.2f} GB per million points."
             )
         m = self.machine
         lines.append(

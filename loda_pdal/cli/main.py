@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 import click
 
 import loda_pdal
-from loda_pdal.cli import stopping, verbosity
+from loda_pdal.cli import process, stopping, verbosity
 from loda_pdal.model.errors import LodaError
 
 COMMANDS = {
@@ -85,6 +85,7 @@ def _failed(message: str, code: int = 1, traced: bool = False) -> int:
 
 
 def main() -> NoReturn:
-    """Entry point of the program: handles signals, then never returns."""
+    """Entry point of the program: never returns."""
+    process.settle()
     stopping.on_signals()
     sys.exit(run(sys.argv[1:]))

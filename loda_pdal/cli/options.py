@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import shutil
+import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from loda_pdal.cli import stopping
 from loda_pdal.cli.progress import KINDS, Reporter
 from loda_pdal.params import PRESETS, Parameters
 
@@ -69,7 +72,9 @@ def compile_kernels(reporter: Reporter) -> Compiled | None:
     from loda_pdal import warmup
 
     reporter.info("Compiling kernels, once: that takes about half a minute.")
-    return warmup.compile_kernels(reporter.progress)
+    with tempfile.TemporaryDirectory(prefix="loda-pdal-") as folder:
+        stopping.before_stopping(lambda: shutil.rmtree(folder, ignore_errors=True))
+        return warmup.compile_kernels(Path(folder), reporter.progress)
 
 
 as_json = click.option("--json", "as_json", is_flag=True, help="Write the result as JSON to stdout.")

@@ -17,7 +17,7 @@ import numpy as np
 import shapely
 
 from loda_pdal.io.plain import to_plain
-from loda_pdal.io.qml import change_style, class_style, label_style, outline_style
+from loda_pdal.io.qml import change_style, class_style, ground_style, label_style, outline_style
 from loda_pdal.io.reviews import EARLIER_LAYER, STATUSES, Review, match_reviews
 from loda_pdal.model.frame import LocalFrame
 from loda_pdal.model.labels import ChangeLabel
@@ -338,11 +338,11 @@ CREATE TABLE layer_styles (
 
 def _embed_styles(path: Path) -> None:
     """The table from which QGIS takes the default style of each layer."""
-    by_label, by_class = label_style(opacity_by_confidence=False), class_style()
+    by_class = class_style()
     styles = {
         "changes": change_style(),
-        "objects": by_label,
-        "ground_changes": by_label,
+        "objects": label_style(),
+        "ground_changes": ground_style(),
         "instances_before": by_class,
         "instances_after": by_class,
         "blocks": outline_style(),

@@ -34,14 +34,26 @@ class Category(NamedTuple):
 
 def change_style() -> str:
     """QML of layer ``changes``: colours by label, opacity by confidence, labels, map tip and the form for reviewing."""
-    return label_style(opacity_by_confidence=True, more=review_elements(), categories=CATEGORIES)
+    legend = [label for label in _LEGEND if label is not ChangeLabel.UNCHANGED]
+    return _document(_by_label(legend, opacity_by_confidence=True), review_elements(), CATEGORIES)
 
 
-def label_style(*, opacity_by_confidence: bool, more: str = "", categories: str = "Symbology") -> str:
+def label_style() -> str:
     """QML that colours polygons by ``label``: Undetermined is hatched, Unchanged is an outline."""
+    return _document(_by_label(_LEGEND))
+
+
+def _by_label(labels: Iterable[ChangeLabel], opacity_by_confidence: bool = False) -> str:
     fills = {ChangeLabel.UNDETERMINED: "hatch", ChangeLabel.UNCHANGED: "none"}
-    legend = [Category(x.title, x.title, LABEL_COLOURS[x], fills.get(x, "solid")) for x in _LEGEND]
-    return _document(_categorised("label", legend, opacity_by_confidence), more, categories)
+    legend = [Category(x.title, x.title, LABEL_COLOURS[x], fills.get(x, "solid")) for x in labels]
+    return _categorised("label", legend, opacity_by_confidence)
+
+
+def ground_style() -> str:
+    """QML of layer ``ground_changes``: raised and lowered ground."""
+    titles = {ChangeLabel.INCREASED: "Raised", ChangeLabel.DECREASED: "Lowered"}
+    legend = [Category(label.title, title, LABEL_COLOURS[label]) for label, title in titles.items()]
+    return _document(_categorised("label", legend, False))
 
 
 def class_style() -> str:

@@ -58,12 +58,17 @@ ALIASES = {
 }
 """How the form names each column, in its order."""
 
-_FINDING = ("object_id", "label", "object_class", "confidence", "reason")
+_FINDING = ("object_id", "label", "object_class", "reason", "confidence", "dh_m", "lod95_m")
 _REVIEW = ("review_status", "review_note", "reviewer", "reviewed_at")
 _EDITABLE = ("review_status", "review_note")
 _ON_UPDATE = {
     "reviewer": "if(length(@user_full_name) > 0, @user_full_name, @user_account_name)",
     "reviewed_at": "now()",
+}
+_DECIMALS = {
+    2: ("confidence", "confidence_raw", "observability", "dv_ratio", "iou_3d"),
+    3: ("height_before_m", "height_after_m", "dh_m", "shift_m", "d_perp_m", "lod95_m", "z_min_m", "z_max_m"),
+    1: ("volume_before_m3", "volume_after_m3", "dv_m3"),
 }
 _COLUMN_IN_NO_FORM = ("fid", "label_code")
 
@@ -89,7 +94,7 @@ def review_elements() -> str:
             "<editorlayout>tablayout</editorlayout><attributeEditorForm>",
             _group("Change", _FINDING),
             _group("Review", _REVIEW),
-            _group("Figures", figures, columns=2),
+            _group("Figures", figures, is_folded=True),
             "</attributeEditorForm>",
             '<previewExpression>"label" || \' \' || "object_class" || \' \' || "object_id"</previewExpression>',
         )
@@ -118,10 +123,9 @@ def _widgets() -> str:
     )
     many_lines = '<Option type="Map"><Option type="bool" name="IsMultiline" value="true"/></Option>'
     choices = f'<Option type="Map"><Option type="List" name="map">{states}</Option></Option>'
-    widgets = {
+    widgets = {name: ("Range", _number(places)) for places, names in _DECIMALS.items() for name in names} | {
         "reason": ("TextEdit", many_lines),
         "review_status": ("ValueMap", choices),
-        "review_note": ("TextEdit", many_lines),
     }
     return (
         "<fieldConfiguration>"
@@ -133,9 +137,20 @@ def _widgets() -> str:
     )
 
 
-def _group(title: str, names: Iterable[str], columns: int = 1) -> str:
+def _number(decimals: int) -> str:
+    """Configuration of a number that is shown with so many decimals."""
+    return (
+        '<Option type="Map"><Option type="bool" name="AllowNull" value="true"/>'
+        '<Option type="double" name="Min" value="-1000000"/><Option type="double" name="Max" value="1000000"/>'
+        f'<Option type="int" name="Precision" value="{decimals}"/><Option type="double" name="Step" value="1"/>'
+        '<Option type="QString" name="Style" value="SpinBox"/></Option>'
+    )
+
+
+def _group(title: str, names: Iterable[str], is_folded: bool = False) -> str:
     fields = "".join(f'<attributeEditorField name="{name}" index="-1" showLabel="1"/>' for name in names)
     return (
-        f'<attributeEditorContainer name="{title}" type="GroupBox" groupBox="1" showLabel="1" columnCount="{columns}">'
+        f'<attributeEditorContainer name="{title}" type="GroupBox" groupBox="1" showLabel="1" columnCount="1" '
+        f'collapsed="{int(is_folded)}">'
         f"{fields}</attributeEditorContainer>"
     )

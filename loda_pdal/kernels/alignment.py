@@ -173,11 +173,10 @@ def _fill_slot(cells, i, j, k, radius, slots, slot, near, n_near):  # type: igno
     x, y, z = low[0] + (i + 0.5) * edge, low[1] + (j + 0.5) * edge, low[2] + (k + 0.5) * edge
     n = int(radius / edge) + 1
     for row in range(max(i - n, 0), min(i + n + 1, len(cells.row_start) - 1)):
-        columns = cells.column_y[cells.row_start[row] : cells.row_start[row + 1]]
-        first, last = np.searchsorted(columns, j - n), np.searchsorted(columns, j + n + 1)
-        for p in range(
-            cells.column_start[cells.row_start[row] + first], cells.column_start[cells.row_start[row] + last]
-        ):
+        end = cells.row_start[row + 1]
+        first = _first_at_least(cells.column_y, cells.row_start[row], end, j - n)
+        last = _first_at_least(cells.column_y, first, end, j + n + 1)
+        for p in range(cells.column_start[first], cells.column_start[last]):
             dx = max(abs(cells.xyz[p, 0] - x) - 0.5 * edge, 0.0)
             dy = max(abs(cells.xyz[p, 1] - y) - 0.5 * edge, 0.0)
             dz = max(abs(cells.xyz[p, 2] - z) - 0.5 * edge, 0.0)
@@ -185,6 +184,18 @@ def _fill_slot(cells, i, j, k, radius, slots, slot, near, n_near):  # type: igno
             n_near += dx * dx + dy * dy + dz * dz <= radius * radius * (1 + 1e-9)
     slots[slot, 4] = n_near
     return n_near
+
+
+@njit(nogil=True, cache=True)
+def _first_at_least(values, a, b, least):  # type: ignore[no-untyped-def]
+    """First of the ascending values [a, b) that is at least ``least``; b if none is."""
+    while a < b:
+        m = (a + b) >> 1
+        if values[m] < least:
+            a = m + 1
+        else:
+            b = m
+    return a
 
 
 @njit(nogil=True, cache=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from loda_pdal.kernels.blocks import end_of_block, nearest_of_block, room_for, room_for_nearest
 from loda_pdal.kernels.geometry import eigen_symmetric_3x3
-from loda_pdal.kernels.neighbours import k_nearest
 
 LINE = 1e-3
 """Middle over largest eigenvalue below which the points lie on a line, which has no normal."""
@@ -16,7 +16,7 @@ LINE = 1e-3
 def plane_range(  # type: ignore[no-untyped-def]
     start, stop, cells, local, radius, k, min_neighbours, max_isotropy, normals, roughness
 ):
-    """Normals and roughness of sorted points [start, stop), written under their index in the cloud.
+    """Normals and roughness of the points in columns [start, stop), written under their index in the cloud.
 
     Parameters
     ----------
@@ -33,63 +33,78 @@ def plane_range(  # type: ignore[no-untyped-def]
     roughness : (n,) float32, m
         1.4826 * MAD of the signed distances to the plane; left alone where there is no plane.
     """
-    best_sq, best_idx = np.empty(k, dtype=np.float64), np.empty(k, dtype=np.int32)
-    residuals = np.empty(k, dtype=np.float64)
-    guess = min(cells.cell_m, radius)
-    for q in range(start, stop):
-        n, guess = k_nearest(
-            cells, cells.xyz[q, 0], cells.xyz[q, 1], cells.xyz[q, 2], guess, radius, -1, best_sq, best_idx
-        )
-        if n < min_neighbours:
-            continue
-        x, y, z = _mean(local, best_idx, n)
-        xx = xy = xz = yy = yz = zz = 0.0
-        for j in range(n):
-            dx, dy, dz = local[best_idx[j], 0] - x, local[best_idx[j], 1] - y, local[best_idx[j], 2] - z
-            xx += dx * dx
-            xy += dx * dy
-            xz += dx * dz
-            yy += dy * dy
-            yz += dy * dz
-            zz += dz * dz
-        large, middle, small, nx, ny, nz = eigen_symmetric_3x3(xx, xy, xz, yy, yz, zz)
-        if middle <= LINE * large or small > max_isotropy * middle:
-            continue
-        i = cells.idx[q]
-        normals[i, 0], normals[i, 1], normals[i, 2] = nx, ny, nz
-        for j in range(n):
-            p = best_idx[j]
-            residuals[j] = nx * (local[p, 0] - x) + ny * (local[p, 1] - y) + nz * (local[p, 2] - z)
-        roughness[i] = mad_sigma(residuals[:n])
+    near, found, guess = room_for(1024), room_for_nearest(k), min(cells.cell_m, radius)
+    residual, ordered, place = np.empty(k), np.empty(k), np.empty(k, dtype=np.int32)
+    for column in range(start, stop):
+        q, column_stop = cells.column_start[column], cells.column_start[column + 1]
+        while q < column_stop:
+            block_stop = end_of_block(cells, q, column_stop)
+            near, guess = nearest_of_block(cells, cells, q, block_stop, guess, radius, False, near, found)
+            for row in range(block_stop - q):
+                n, i = found.n[row], cells.idx[q + row]
+                if n < min_neighbours:
+                    continue
+                x, y, z, large, middle, small, nx, ny, nz = _plane(local, found.idx, row, n)
+                if middle <= LINE * large or small > max_isotropy * middle:
+                    continue
+                normals[i, 0], normals[i, 1], normals[i, 2] = nx, ny, nz
+                for j in range(n):
+                    p = found.idx[row, j]
+                    residual[j] = nx * (local[p, 0] - x) + ny * (local[p, 1] - y) + nz * (local[p, 2] - z)
+                roughness[i] = mad_sigma(residual, n, ordered, place)
+            q = block_stop
 
 
 @njit(nogil=True, cache=True)
-def mad_sigma(values):  # type: ignore[no-untyped-def]
-    """Robust standard deviation, 1.4826 * median of absolute deviations from the median; ``values`` is overwritten."""
-    middle = _median(values)
-    for j in range(len(values)):
-        values[j] = abs(values[j] - middle)
-    return 1.4826 * _median(values)
-
-
-@njit(nogil=True, cache=True)
-def _median(values):  # type: ignore[no-untyped-def]
-    """Median; sorts ``values`` in place, by insertion: there are few."""
-    n = len(values)
-    for j in range(1, n):
-        value, i = values[j], j
-        while i > 0 and values[i - 1] > value:
-            values[i] = values[i - 1]
-            i -= 1
-        values[i] = value
-    return 0.5 * (values[(n - 1) // 2] + values[n // 2])
-
-
-@njit(nogil=True, cache=True)
-def _mean(local, idx, n):  # type: ignore[no-untyped-def]
+def _plane(local, idx, row, n):  # type: ignore[no-untyped-def]
+    """Mean, eigenvalues of the scatter matrix and normal of the points in a row of ``idx``."""
     x = y = z = 0.0
     for j in range(n):
-        x += local[idx[j], 0]
-        y += local[idx[j], 1]
-        z += local[idx[j], 2]
-    return x / n, y / n, z / n
+        p = idx[row, j]
+        x, y, z = x + local[p, 0], y + local[p, 1], z + local[p, 2]
+    x, y, z = x / n, y / n, z / n
+    xx = xy = xz = yy = yz = zz = 0.0
+    for j in range(n):
+        p = idx[row, j]
+        dx, dy, dz = local[p, 0] - x, local[p, 1] - y, local[p, 2] - z
+        xx, xy, xz = xx + dx * dx, xy + dx * dy, xz + dx * dz
+        yy, yz, zz = yy + dy * dy, yz + dy * dz, zz + dz * dz
+    large, middle, small, nx, ny, nz = eigen_symmetric_3x3(xx, xy, xz, yy, yz, zz)
+    return x, y, z, large, middle, small, nx, ny, nz
+
+
+@njit(nogil=True, cache=True)
+def mad_sigma(values, n, ordered, place):  # type: ignore[no-untyped-def]
+    """Robust standard deviation of the first ``n`` values, 1.4826 * median of absolute deviations from the median.
+
+    ``ordered`` and ``place`` are room for as many.
+    """
+    _sort(values, n, ordered, place)
+    middle = 0.5 * (ordered[(n - 1) // 2] + ordered[n // 2])
+    # deviations grow from the middle to both ends: two pointers meet them in order
+    above = n // 2
+    below = above - 1
+    deviation = last = 0.0
+    for _ in range(n // 2 + 1):
+        last = deviation
+        if above < n and (below < 0 or ordered[above] - middle < middle - ordered[below]):
+            deviation = abs(ordered[above] - middle)
+            above += 1
+        else:
+            deviation = abs(ordered[below] - middle)
+            below -= 1
+    return 1.4826 * (deviation if n % 2 else 0.5 * (last + deviation))
+
+
+@njit(nogil=True, cache=True)
+def _sort(values, n, ordered, place):  # type: ignore[no-untyped-def]
+    """The first ``n`` values in order: each goes where there are so many smaller ones, which needs no branches."""
+    for j in range(n):
+        n_larger = 0
+        for i in range(j):
+            is_larger = values[i] > values[j]
+            place[i] += is_larger
+            n_larger += is_larger
+        place[j] = j - n_larger
+    for j in range(n):
+        ordered[place[j]] = values[j]

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from loda_pdal.kernels.blocks import run_columns
+from loda_pdal.kernels.cells import block_edge, build_cells
 from loda_pdal.kernels.features import shape_features
-from loda_pdal.kernels.neighbours import build_cells
-from loda_pdal.kernels.parallel import run_ranges
 from loda_pdal.model.cloud import BoolArray, Float32Array, FloatArray
 from loda_pdal.params import FeatureParams
 
@@ -66,6 +66,6 @@ def eigen_features(xyz: FloatArray, height: FloatArray, params: FeatureParams) -
     normals = np.zeros((m, 3), dtype=np.float32)
     is_valid = np.zeros(m, dtype=np.bool_)
     if m:
-        cells = build_cells(xyz, params.radius_m / 2)
-        run_ranges(shape_features, m, cells, params.radius_m, params.min_neighbours, values, normals, is_valid)
+        cells = build_cells(xyz, max(params.radius_m, block_edge(xyz)))
+        run_columns(shape_features, cells, params.radius_m, params.min_neighbours, values, normals, is_valid)
     return Features(values, normals, is_valid)

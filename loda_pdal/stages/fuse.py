@@ -47,7 +47,7 @@ def fuse_survey(survey: Survey, params: FuseParams) -> VoxelCloud:
     for xyz in survey.parts():
         number = voxel_idx[start : start + len(xyz)]
         numbers.of(grid.keys(xyz), number)
-        total, count = enlarged(total, numbers.capacity), enlarged(count, numbers.capacity)
+        total, count = _enlarged(total, numbers.capacity), _enlarged(count, numbers.capacity)
         add_points(number, np.ascontiguousarray(xyz), total, count)
         start += len(xyz)
     order = np.argsort(numbers.keys)
@@ -147,11 +147,11 @@ class _Numbers:
     def _grow(self) -> None:
         size = max(4 * len(self._table), 1 << 18)
         self._table = np.full(size, -1, dtype=np.int32)
-        self._distinct = enlarged(self._distinct, size // 2)
+        self._distinct = _enlarged(self._distinct, size // 2)
         fill_table(self._table, self._distinct, self._n)
 
 
-def enlarged(values: npt.NDArray[Any], n: int) -> npt.NDArray[Any]:
+def _enlarged(values: npt.NDArray[Any], n: int) -> npt.NDArray[Any]:
     """An array of ``n`` rows that begins with ``values`` and goes on with zeros; ``values`` itself if long enough."""
     if len(values) >= n:
         return values

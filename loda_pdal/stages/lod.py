@@ -10,6 +10,7 @@ from loda_pdal.kernels.parallel import run_ranges
 from loda_pdal.model.cloud import FloatArray, Int64Array
 from loda_pdal.model.grid import cells_of
 from loda_pdal.model.lod_grid import LodGrid
+from loda_pdal.model.pair import Pair, at_once
 from loda_pdal.params import LodParams
 from loda_pdal.stages.drift import SURFACE_NOISE_M, drift_covariance, rigid_part
 from loda_pdal.stages.fuse import voxel_of_point
@@ -55,7 +56,7 @@ def level_of_detection(
     normal, is_valid = np.zeros((n_cells, 3)), np.zeros(n_cells, np.bool_)
     sigma, offset = np.full((n_cells, 2), np.nan), np.full((n_cells, 2), np.nan)
     local = middle_of(centres)
-    before, after = (build_cells(xyz, params.radius_m / 2, local) for xyz in (before_xyz, after_xyz))
+    before, after = at_once(lambda xyz: build_cells(xyz, params.radius_m / 2, local), Pair(before_xyz, after_xyz))
     if len(before_xyz) and len(after_xyz):  # a cell list without points has nothing to look in
         run_ranges(
             pool_range,

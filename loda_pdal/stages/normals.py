@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loda_pdal.kernels.neighbours import build_cells, to_cell_frame
-from loda_pdal.kernels.parallel import run_ranges
+from loda_pdal.kernels.blocks import run_columns
+from loda_pdal.kernels.cells import block_edge, build_cells, to_cell_frame
 from loda_pdal.kernels.planes import plane_range
 from loda_pdal.model.cloud import BoolArray, Float32Array, FloatArray
 from loda_pdal.params import NormalParams
@@ -51,10 +51,9 @@ def estimate_normals(xyz: FloatArray, params: NormalParams) -> Normals:
     normals = np.zeros((len(xyz), 3), dtype=np.float32)
     roughness = np.full(len(xyz), np.nan, dtype=np.float32)
     if len(xyz):
-        cells = build_cells(xyz, params.radius_m / 2)
-        run_ranges(
+        cells = build_cells(xyz, block_edge(xyz))
+        run_columns(
             plane_range,
-            len(xyz),
             cells,
             to_cell_frame(cells, xyz),
             params.radius_m,

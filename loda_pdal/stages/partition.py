@@ -14,10 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from loda_pdal.kernels.partition import (
+    N_FEATURES,
     carry_partners,
     connected_labels,
     contract,
     find_partners,
+    find_voxel_partners,
     fit_regions,
     members,
     merge_partners,
@@ -28,9 +30,12 @@ from loda_pdal.model.cloud import Float32Array, FloatArray, IntArray
 QUANTUM = 2.0**-16
 """Features and weights are whole multiples of this: their sums, and so the energies, are exact in float64."""
 
+_FLOAT32_EXACT = 1 << 24
+"""Integers up to this are exact in float32."""
+
 _LEVELS = 3
 _SWEEPS = 2
-_MERGE_ROUNDS_FIRST, _MERGE_ROUNDS, _MERGE_ROUNDS_LAST = 1, 3, 4
+_MERGE_ROUNDS, _MERGE_ROUNDS_LAST = 3, 4
 _LEAST_FALL = 0.002
 """Share of the energy by which a level must lower it for another level to follow."""
 _LEAST_MERGES = 0.0005
@@ -63,9 +68,9 @@ class Regions(NamedTuple):
         Region of each voxel.
     order, start : (m,), (n + 1,) int32
         Voxels of region r: ``order[start[r]:start[r + 1]]``.
-    medians : (n, d) float32
+    medians : (n, 5) float32
         Lower median of each feature in each region.
-    deviations : (n, d) float64
+    deviations : (n, 5) float64
         Sum of absolute deviations from it.
     graph : Graph
         Regions as nodes; weights are sums over the edges between two regions.
@@ -100,11 +105,6 @@ class Partition(NamedTuple):
     n_levels: int
 
 
-def quantised(values: npt.NDArray[Any]) -> Float32Array:
-    """Values as float32, rounded to multiples of `QUANTUM`."""
-    return np.asarray(np.rint(values / QUANTUM) * QUANTUM, dtype=np.float32)
-
-
 def minimise_energy(graph: Graph, features: Float32Array) -> Partition:
     """Connected regions of a graph that make the L1 Potts energy small.
 
@@ -130,7 +130,7 @@ def minimise_energy(graph: Graph, features: Float32Array) -> Partition:
     Paper, section 4.2, equation 4.
     """
     voxels = single_voxels(graph, features)
-    regions = _merged(voxels, features, _MERGE_ROUNDS_FIRST)
+    regions = _paired(voxels, features)
     energies = [voxels.energy, regions.energy]
     n_levels = 0
     for _ in range(_LEVELS):
@@ -159,45 +159,96 @@ def regrouped(regions: Regions, group: IntArray, n_groups: int, features: Float3
     """The partition in which region r is part of region ``group[r]``, 0 to ``n_groups - 1``, none of them empty."""
     labels = group[regions.labels]
     order, start = members(labels, n_groups)
-    medians = np.empty((n_groups, features.shape[1]), dtype=np.float32)
-    deviations = np.empty((n_groups, features.shape[1]))
+    medians = np.empty((n_groups, N_FEATURES), dtype=np.float32)
+    deviations = np.empty((n_groups, N_FEATURES))
     medians[group], deviations[group] = regions.medians, regions.deviations
-    is_joined = np.bincount(group, minlength=n_groups) > 1
-    fit_regions(features, order, start, is_joined, medians, deviations)
-    graph = Graph(*contract(*regions.graph, group, n_groups))
-    return Regions(labels, order, start, medians, deviations, graph)
+    fit_regions(features, order, start, np.bincount(group, minlength=n_groups) > 1, medians, deviations)
+    return Regions(labels, order, start, medians, deviations, _contracted(regions.graph, group, n_groups))
+
+
+def _contracted(graph: Graph, group: IntArray, n_groups: int, dtype: npt.DTypeLike = np.float64) -> Graph:
+    """The graph whose nodes are groups of nodes, with weights of type ``dtype``."""
+    return Graph(*contract(*graph, group, np.empty(n_groups, dtype)))
 
 
 def _moved(
     nodes: Regions, labels: IntArray, regions: Regions, features: Float32Array, *, opens_regions: bool
 ) -> Regions:
     """Connected regions after moving ``nodes``, of which ``labels`` says in which of the ``regions`` they are."""
-    medians = np.empty((len(nodes), features.shape[1]), dtype=np.float32)
+    medians = np.empty((len(nodes), N_FEATURES), dtype=np.float32)
     medians[: len(regions)] = regions.medians
-    move_nodes(*nodes.graph, features, nodes.order, nodes.start, labels, medians, len(regions), _SWEEPS, opens_regions)
+    move_nodes(
+        *nodes.graph,
+        features,
+        nodes.order,
+        nodes.start,
+        nodes.medians,
+        nodes.deviations,
+        labels,
+        medians,
+        len(regions),
+        _SWEEPS,
+        opens_regions,
+    )
     connected, n = connected_labels(nodes.graph.first_arc, nodes.graph.heads, labels)
     return regrouped(nodes, connected, n, features)
 
 
+def _paired(voxels: Regions, features: Float32Array) -> Regions:
+    """Mutually best voxels in pairs, all others single.
+
+    This is the largest of the graphs of regions. A weight is the sum of at most four, exact in float32 unless beta is
+    very large.
+    """
+    n = len(voxels)
+    partner, weight, gain = np.empty(n, dtype=np.int32), np.empty(n), np.empty(n)
+    find_voxel_partners(*voxels.graph, features, partner, weight, gain)
+    is_exact = 4 * np.max(voxels.graph.weights, initial=0.0) <= _FLOAT32_EXACT * QUANTUM
+    return _united(voxels, partner, weight, features, np.float32 if is_exact else np.float64)[0]
+
+
 def _merged(regions: Regions, features: Float32Array, n_rounds: int) -> Regions:
     """Regions after ``n_rounds`` of merging mutually best neighbours."""
-    partner, weight = np.full(len(regions), -1, dtype=np.int32), np.zeros(len(regions))
-    is_dirty = np.ones(len(regions), dtype=np.bool_)
+    n = len(regions)
+    partner, weight, gain = np.empty(n, dtype=np.int32), np.empty(n), np.empty(n)
+    is_new = np.ones(n, dtype=np.bool_)
     for _ in range(n_rounds):
         n = len(regions)
-        find_partners(*regions.graph, regions.start, regions.medians, regions.deviations, is_dirty, partner, weight)
-        group = np.empty(n, dtype=np.int32)
-        n_groups, n_merges = merge_partners(
-            features, regions.order, regions.start, regions.deviations, partner, weight, group
-        )
-        if n_merges == 0:
+        find_partners(*regions.graph, regions.start, regions.medians, regions.deviations, is_new, partner, weight, gain)
+        regions, group = _united(regions, partner, weight, features)
+        m = len(regions)
+        if n - m < _LEAST_MERGES * n:
             break
-        regions = regrouped(regions, group, n_groups, features)
-        old_partner, old_weight = partner, weight
-        partner, weight = np.empty(n_groups, dtype=np.int32), np.empty(n_groups)
-        is_dirty = np.zeros(n_groups, dtype=np.bool_)
-        is_merged = np.bincount(group, minlength=n_groups) > 1
-        carry_partners(old_partner, old_weight, group, is_merged, *regions.graph[:2], partner, weight, is_dirty)
-        if n_merges < _LEAST_MERGES * n:
-            break
+        known = partner, weight, gain
+        partner, weight, gain = np.empty(m, dtype=np.int32), np.empty(m), np.empty(m)
+        carry_partners(*known, group, partner, weight, gain)
+        is_new = np.bincount(group) > 1
     return regions
+
+
+def _united(
+    regions: Regions,
+    partner: IntArray,
+    weight: FloatArray,
+    features: Float32Array,
+    dtype: npt.DTypeLike = np.float64,
+) -> tuple[Regions, IntArray]:
+    """Regions after merging mutual partners where the energy falls, and what each old region (n,) is part of."""
+    group = np.empty(len(regions), dtype=np.int32)
+    medians, deviations = np.empty_like(regions.medians), np.empty_like(regions.deviations)
+    n = merge_partners(
+        features,
+        regions.order,
+        regions.start,
+        regions.medians,
+        regions.deviations,
+        partner,
+        weight,
+        group,
+        medians,
+        deviations,
+    )
+    labels = group[regions.labels]
+    order, start = members(labels, n)
+    graph = _contracted(regions.graph, group, n, dtype)
+    return Regions(labels, order, start, medians[:n], deviations[:n], graph), group

@@ -9,7 +9,14 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from loda_pdal.kernels.neighbours import knn
-from loda_pdal.kernels.partition import closest_neighbours, connected_labels, sq_feature_distances, symmetric_arcs
+from loda_pdal.kernels.partition import (
+    closest_neighbours,
+    connected_labels,
+    rank_bits,
+    sq_feature_distances,
+    standardise,
+    symmetric_arcs,
+)
 from loda_pdal.model.cloud import Float32Array, FloatArray, IntArray
 from loda_pdal.model.groups import consecutive
 from loda_pdal.params import SuperpointParams
@@ -19,7 +26,6 @@ from loda_pdal.stages.partition import (
     Graph,
     Regions,
     minimise_energy,
-    quantised,
     regrouped,
     single_voxels,
 )
@@ -28,6 +34,8 @@ _NEAR_GROUND_M = 0.3
 """With method ``components``, voxels below and above this height are never in one superpoint: else all is one."""
 
 _HEIGHT = 4
+
+_PART = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -92,8 +100,8 @@ def superpoints(xyz: FloatArray, features: Features, params: SuperpointParams) -
         partition = minimise_energy(graph, standard)
         regions, n_rounds = partition.regions, partition.n_levels
     absorbed = absorb_small(regions, standard, params.absorb_below)
-    labels, n = consecutive(absorbed.labels)
-    return Superpoints(labels, n, absorbed.energy, n_rounds, len(regions) - len(absorbed), regions.energy)
+    n_absorbed = len(regions) - len(absorbed)
+    return Superpoints(absorbed.labels, len(absorbed), absorbed.energy, n_rounds, n_absorbed, regions.energy)
 
 
 def standardised(features: Features) -> Float32Array:
@@ -101,10 +109,10 @@ def standardised(features: Features) -> Float32Array:
 
     A feature that does not vary is 0 everywhere.
     """
-    values = features.values.astype(np.float64)
-    known = values[features.is_valid] if features.is_valid.any() else values
-    spread = known.std(axis=0)
-    return quantised(np.where(spread > 1e-9, (values - known.mean(axis=0)) / np.maximum(spread, 1e-9), 0.0))
+    is_known = features.is_valid if features.is_valid.any() else np.ones_like(features.is_valid)
+    standard = np.empty_like(features.values)
+    standardise(features.values, is_known, QUANTUM, standard)
+    return standard
 
 
 def voxel_graph(xyz: FloatArray, standard: Float32Array, params: SuperpointParams) -> Graph:
@@ -113,16 +121,12 @@ def voxel_graph(xyz: FloatArray, standard: Float32Array, params: SuperpointParam
     sigma is the median distance of features over the edges; weights are rounded to `QUANTUM`.
     """
     first_arc, heads = symmetric_arcs(knn(xyz, params.k, params.max_edge_m, includes_self=False).idx)
-    sq_distances = np.empty(len(heads), dtype=np.float32)
-    sq_feature_distances(first_arc, heads, standard, sq_distances)
-    sq_sigma = _lower_median(sq_distances)
-    if sq_sigma > 0:
-        weights = np.exp(np.divide(sq_distances, -sq_sigma, out=sq_distances), out=sq_distances)
-    else:
-        weights = (sq_distances == 0).astype(np.float32)
-    weights *= params.beta / QUANTUM
-    np.rint(weights, out=weights)
-    weights *= QUANTUM
+    weights = sq_feature_distances(first_arc, heads, standard)  # becomes weights part by part, each fits the cache
+    sq_sigma = _lower_median(weights)
+    for start in range(0, len(weights), _PART):
+        part = weights[start : start + _PART]
+        similarity = np.exp(part / -sq_sigma) if sq_sigma > 0 else part == 0
+        part[:] = np.rint(similarity * np.float32(params.beta / QUANTUM)) * np.float32(QUANTUM)
     return Graph(first_arc, heads, weights)
 
 
@@ -148,5 +152,4 @@ def _lower_median(values: Float32Array) -> float:
     """Lower median of (a,) values; 0 if there are none."""
     if len(values) == 0:
         return 0.0
-    middle = (len(values) - 1) // 2
-    return float(np.partition(values, middle)[middle])
+    return float(np.int32(rank_bits(values.view(np.int32), (len(values) - 1) // 2)).view(np.float32))

@@ -10,6 +10,9 @@ CHANGE_CLASSES = (
 )
 """Values of the dimension ChangeClass with title and colour."""
 
+NO_CHANGE, FAINT = (0, 1), 80
+"""Classes whose points stay in the background, and their opacity of 255."""
+
 LOD_CLASSES = (
     (0.02, "#ffffd9"),
     (0.05, "#c7e9b4"),

@@ -21,7 +21,7 @@ from qgis.core import (
 from qgis.PyQt import sip
 from qgis.PyQt.QtGui import QColor
 
-from .legend import CHANGE_CLASSES, LOD_CLASSES
+from .legend import CHANGE_CLASSES, FAINT, LOD_CLASSES, NO_CHANGE
 
 PICTURE_IN_TIP = "[% coalesce(loda_picture(@layer_id, \"object_id\"), '') %]"
 """Added to the map tip that the GeoPackage brings: the before and after picture, where the report has one."""
@@ -68,8 +68,9 @@ def load_later(folder, context):
         if not can_open(uri):
             continue
         details = QgsProcessingContext.LayerDetails(name, context.project(), name, _hint(source))
-        details.groupName = f"Changes in {folder.name}"
+        details.groupName = f"LoDA: {folder.name}"
         details.layerSortKey = place
+        details.forceName = True  # not the name of the file
         details.setPostProcessor(_new_styler())
         context.addLayerToLoadOnCompletion(uri, details)
 
@@ -120,7 +121,11 @@ def _style_lod(layer):
 
 
 def _style_cloud(layer):
-    categories = [QgsPointCloudCategory(code, QColor(colour), title) for code, title, colour in CHANGE_CLASSES]
+    categories = []
+    for code, title, colour in CHANGE_CLASSES:
+        shown = QColor(colour)
+        shown.setAlpha(FAINT if code in NO_CHANGE else 255)
+        categories.append(QgsPointCloudCategory(code, shown, title))
     renderer = QgsPointCloudClassifiedRenderer("ChangeClass", categories)
     renderer.setPointSize(0.6)
     layer.setRenderer(renderer)

@@ -158,7 +158,7 @@ def test_all_layers_load_named_grouped_and_styled(run, surveys, folder, project,
     for uri, details in waiting.items():
         layer = QgsProcessingUtils.mapLayerFromString(uri, context, True, details.layerTypeHint)
         assert layer is not None and layer.isValid(), uri
-        assert details.groupName == "Changes in street"
+        assert details.groupName == "LoDA: street" and details.forceName
         project.addMapLayer(context.takeResultLayer(layer.id()))
         details.postProcessor().postProcessLayer(layer, context, feedback)
         layers[details.name] = layer
@@ -179,13 +179,14 @@ def test_all_layers_load_named_grouped_and_styled(run, surveys, folder, project,
     cloud = layers["Points by change"]
     assert isinstance(cloud, QgsPointCloudLayer) and cloud.renderer().attribute() == "ChangeClass"
     counts = pixels(rendered([cloud], cloud.extent(), 300))
-    assert nearest(counts, number(COLOURS["Added"])) > 20 and nearest(counts, number("#9aa0a6")) > 500
+    assert nearest(counts, number(COLOURS["Added"])) > 20 and nearest(counts, number("#9aa0a6", 80 / 255)) > 500
 
 
 def test_the_form_lets_nothing_be_edited_but_the_review(changes):
     form, fields = changes.editFormConfig(), changes.fields()
     editable = {f.name() for i, f in enumerate(fields) if not form.readOnly(i)}
     assert editable == {"review_status", "review_note"}
+    assert changes.editorWidgetSetup(fields.indexOf("dh_m")).config()["Precision"] == 3
     choices = changes.editorWidgetSetup(fields.indexOf("review_status"))
     assert choices.type() == "ValueMap"
     assert [next(iter(c.values())) for c in choices.config()["map"]] == [
