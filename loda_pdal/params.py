@@ -419,6 +419,9 @@ class ChangeParams(StageParams):
         low=0,
         high=1000,
     )
+    volume_sigmas: float = param(
+        0.0, "gained less lost voxels must exceed this many times the root of their sum; 0: need not", low=0, high=100
+    )
     replaced_m: float = param(
         0.15,
         "difference of the tops that makes a parked vehicle another one, where its surface moved by half of that; "
@@ -432,6 +435,16 @@ class ChangeParams(StageParams):
         15.0, "only objects longer than this are looked through for parts", unit="m", low=0, high=1000
     )
     part_min_voxels: int = param(24, "occupancy voxels of the smallest part", low=1, high=10000)
+    part_is_new_m3: float = param(
+        80.0,
+        "a part of a building that only one survey has, and as large as this, is a building that was Added or Removed",
+        unit="m3",
+        low=0,
+        high=100000,
+    )
+    fills_buildings: bool = param(
+        False, "buildings fill the space beneath their roofs: airborne surveys hardly see walls"
+    )
 
 
 @dataclass(frozen=True)
@@ -685,7 +698,15 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "mobile_min_voxels": 6,
             "other_min_voxels": 6,
         },
-        "changes": {"voxel_m": 1.0, "query_radius_m": 1.2, "min_samples": 20},
+        "changes": {
+            "voxel_m": 1.0,
+            "query_radius_m": 1.2,
+            "min_samples": 20,
+            "min_expected_points": 0.0,
+            "volume_sigmas": 3.0,
+            "vegetation_height_m": 0.8,
+            "fills_buildings": True,
+        },
         "observability": {"cell_m": 2.0},
     },
     "paper": {

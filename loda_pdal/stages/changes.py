@@ -95,7 +95,10 @@ def decide_changes(
     evidence = weigh(cells, cast.surfaces, len(cast), params)
     surfaces, object_class, parent, is_apart = cast.surfaces, cast.object_class, cast.parent, cast.is_apart
     cues = _rows(evidence, object_class)
-    verdicts = [_verdict(cue, apart, params, observability) for cue, apart in zip(cues, is_apart.tolist(), strict=True)]
+    verdicts = [
+        _verdict(cue, apart, part, params, observability)
+        for cue, apart, part in zip(cues, is_apart.tolist(), (parent >= 0).tolist(), strict=True)
+    ]
     raw = np.array(
         [
             _raw(cue, v, apart, params, confidence)
@@ -205,6 +208,8 @@ class Cue(NamedTuple):
     observability: float
     rise: float
     n_voxels: float
+    volume_before: float
+    volume_after: float
 
 
 class Verdict(NamedTuple):
@@ -220,8 +225,9 @@ def _rows(evidence: Evidence, object_class: ByteArray) -> list[Cue]:
         evidence.n_voxels.after > 0,
         evidence.support.before,
         evidence.support.after,
-        *(getattr(evidence, name) for name in Cue._fields[5:-1]),
+        *(getattr(evidence, name) for name in Cue._fields[5:-3]),
         np.fmax(evidence.n_voxels.before, evidence.n_voxels.after),
+        *evidence.volume,
     )
     return [
         Cue(ObjectClass(code), *values)
@@ -248,7 +254,9 @@ def _is_apart(cue: Cue, params: ChangeParams) -> bool:
     return max(cue.support_before, cue.support_after) < params.min_support
 
 
-def _verdict(cue: Cue, is_apart: bool, params: ChangeParams, observability: ObservabilityParams) -> Verdict:
+def _verdict(
+    cue: Cue, is_apart: bool, is_part: bool, params: ChangeParams, observability: ObservabilityParams
+) -> Verdict:
     """Label of one object; ``is_apart``: it was matched, but the pair turned out to be two objects."""
     if not (cue.is_before and cue.is_after):
         return _unmatched(cue, is_apart, params, observability)
@@ -260,7 +268,24 @@ def _verdict(cue: Cue, is_apart: bool, params: ChangeParams, observability: Obse
         )
     if cue.object_class == ObjectClass.MOBILE:
         return _mobile(cue, params)
+    if is_part and cue.object_class == ObjectClass.BUILDING and (verdict := _new_part(cue, params)):
+        return verdict
     return _pair(cue, params)
+
+
+def _new_part(cue: Cue, params: ChangeParams) -> Verdict | None:
+    """A part as large as a building where the other survey has next to nothing: one house of a row came or went."""
+    large, small = max(cue.volume_before, cue.volume_after), min(cue.volume_before, cue.volume_after)
+    if params.part_is_new_m3 == 0 or large < params.part_is_new_m3 or small > _NEXT_TO_NOTHING * large:
+        return None
+    label, other = (
+        (ChangeLabel.ADDED, "before") if cue.volume_after > cue.volume_before else (ChangeLabel.REMOVED, "after")
+    )
+    return Verdict(label, f"{large:.0f} m3 of building in a row, of which the {other} survey shows {small:.0f} m3")
+
+
+_NEXT_TO_NOTHING = 0.2
+"""Share of a part's volume that may be its neighbours' walls."""
 
 
 def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: ObservabilityParams) -> Verdict:
@@ -316,6 +341,8 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
     is_lowered = least == 0 or cue.lost_above >= least_above or cue.column_rise < -height_m / 2
     rises = has_height and cue.dh > 0 and is_raised
     sinks = has_height and cue.dh < 0 and is_lowered
+    noise = params.volume_sigmas * math.sqrt(cue.gained + cue.lost)
+    has_volume = has_volume and abs(cue.gained - cue.lost) >= noise
     swells = has_volume and cue.dv_ratio > 0 and (least == 0 or cue.gained >= max(least, cue.lost))
     shrinks = has_volume and cue.dv_ratio < 0 and (least == 0 or cue.lost >= max(least, cue.gained))
     figures = _figures(cue, height_m, ratio, gate)

@@ -53,6 +53,7 @@ class Objects:
 def match_instances(
     xyz: Pair[FloatArray],
     instances: Pair[Instances],
+    bodies: Pair[tuple[FloatArray, IntArray]],
     descriptors: Pair[Descriptors],
     proxy_pairs: tuple[Pair[IntArray], Matches] | None,
     reach_m: float,
@@ -66,6 +67,8 @@ def match_instances(
         Fused points in the analysis frame.
     instances, descriptors : Pair
         What was segmented, and its descriptors.
+    bodies : Pair of ((k, 3) float64 m, (k,) int32)
+        Points that say what space the instances take, and the instance of each.
     proxy_pairs : (Pair of (m,) int32, Matches) or None
         Proxy of each voxel and the matched proxies (paper, section 4.1): instances of one class that lie in matched
         proxies and in no pair of their own are paired too. None where the preset has no proxies.
@@ -75,11 +78,11 @@ def match_instances(
     pairs = _assign_by_class(instances, descriptors, params)
     if proxy_pairs is not None:
         pairs = np.concatenate([pairs, _pairs_by_proxy(instances, *proxy_pairs, pairs)])
+    n_before, n_after = len(instances.before), len(instances.after)
     votes = Pair(
-        _shared_surface(xyz.before, instances.before, xyz.after, instances.after, reach_m),
-        _shared_surface(xyz.after, instances.after, xyz.before, instances.before, reach_m),
+        _shared_space(*bodies.before, n_before, *bodies.after, n_after, reach_m),
+        _shared_space(*bodies.after, n_after, *bodies.before, n_before, reach_m),
     )
-    n_before = len(instances.before)
     only_before = _left_over(votes.before, pairs[:, 0])
     only_after = _left_over(votes.after, pairs[:, 1])
     joins = [
@@ -140,23 +143,21 @@ def _largest_by_proxy_and_class(instances: Instances, proxy: IntArray) -> dict[t
     return {slot: index for slot, (_, index) in best.items()}
 
 
-def _shared_surface(
-    xyz: FloatArray, instances: Instances, other_xyz: FloatArray, others: Instances, reach_m: float
+def _shared_space(
+    xyz: FloatArray, instance: IntArray, n: int, other_xyz: FloatArray, other: IntArray, n_others: int, reach_m: float
 ) -> _Votes:
-    n = len(instances)
-    members = np.flatnonzero(instances.instance > 0)
-    other_members = np.flatnonzero(others.instance > 0)
+    """Votes of the points of instances 1 to ``n`` for those of the other epoch, 1 to ``n_others``."""
     support, partner = np.zeros(n), np.full(n, -1, np.int32)
-    if len(members) == 0 or len(other_members) == 0:
+    if len(xyz) == 0 or len(other_xyz) == 0:
         return _Votes(support, partner)
-    found, _ = nearest(other_xyz[other_members], xyz[members], reach_m)
-    own = instances.instance[members] - 1
-    voxels = np.maximum(np.bincount(own, minlength=n), 1)
+    found, _ = nearest(other_xyz, xyz, reach_m)
+    own = instance - 1
+    points = np.maximum(np.bincount(own, minlength=n), 1)
     is_near = found >= 0
-    support = np.bincount(own[is_near], minlength=n) / voxels
-    theirs = others.instance[other_members][found[is_near]] - 1
-    key, votes = np.unique(own[is_near].astype(np.int64) * len(others) + theirs, return_counts=True)
-    own_of, theirs_of = np.divmod(key, len(others))
+    support = np.bincount(own[is_near], minlength=n) / points
+    theirs = other[found[is_near]] - 1
+    key, votes = np.unique(own[is_near].astype(np.int64) * n_others + theirs, return_counts=True)
+    own_of, theirs_of = np.divmod(key, n_others)
     order = np.lexsort((theirs_of, -votes, own_of))
     is_first = np.ones(len(order), np.bool_)
     is_first[1:] = own_of[order][1:] != own_of[order][:-1]

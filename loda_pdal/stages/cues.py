@@ -387,6 +387,7 @@ def _displacement(surfaces: Pair[Surface], found: Pair[IntArray]) -> tuple[Float
     n_a = np.where(np.sum(n_b * n_a, axis=1, keepdims=True) < 0, -n_a, n_a)
     mean = n_b + n_a
     length = np.linalg.norm(mean, axis=1, keepdims=True)
+    length[~(n_b.any(axis=1) & n_a.any(axis=1))] = 0.0
     mean = np.divide(mean, length, out=np.zeros_like(mean), where=length > 0.5)
     offset = np.sum(mean * (surfaces.after.xyz[a] - surfaces.before.xyz[b]), axis=1)
     normal[is_both] = mean

@@ -74,7 +74,7 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangePar
         *_regions(cells, own.before, cells.is_near.after, ~is_pair, params),
         *_regions(cells, own.after, cells.is_near.before, ~is_pair, params),
     ]
-    columns, part, parent = _claim(regions, _columns_of(cells, n))
+    columns, part, parent = _claim(regions, _columns_of(cells, n), fills_hull=not params.fills_buildings)
     if len(parent) == 0:
         return Parts(owner, nobody)
     lattice = Lattice.around(columns)
@@ -130,8 +130,17 @@ def _regions(
     return found
 
 
+def _under(region: Int64Array, columns: Int64Array, *, fills_hull: bool) -> BoolArray:
+    """Which columns (k, 2) lie under a region: inside its hull where rays leave gaps in it, else in or beside it."""
+    if fills_hull:
+        outline = shapely.convex_hull(shapely.MultiPoint(region + 0.5)).buffer(1.0)
+        return np.asarray(shapely.contains_xy(outline, columns[:, 0] + 0.5, columns[:, 1] + 0.5))
+    distance, _ = cKDTree(region).query(columns, distance_upper_bound=1.1)
+    return np.asarray(np.isfinite(distance))
+
+
 def _claim(
-    regions: list[_Region], columns_of: tuple[Int64Array, Int64Array]
+    regions: list[_Region], columns_of: tuple[Int64Array, Int64Array], *, fills_hull: bool
 ) -> tuple[Int64Array, Int64Array, IntArray]:
     """Columns (k, 3) that parts take, the part of each, and the parent of each part; the largest region comes first."""
     rows, start = columns_of
@@ -139,8 +148,7 @@ def _claim(
     parents: list[int] = []
     for region in sorted(regions, key=lambda r: (-r.n_voxels, r.parent, r.columns[0].tolist())):
         first, last = start[region.parent], start[region.parent + 1]
-        outline = shapely.convex_hull(shapely.MultiPoint(region.columns + 0.5)).buffer(1.0)
-        is_inside = shapely.contains_xy(outline, rows[first:last, 1] + 0.5, rows[first:last, 2] + 0.5)
+        is_inside = _under(region.columns, rows[first:last, 1:], fills_hull=fills_hull)
         if np.count_nonzero(is_inside) > _MOST_OF * (last - first):
             continue
         is_free = is_inside & (part_of[first:last] < 0)
