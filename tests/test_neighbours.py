@@ -14,12 +14,10 @@ from loda_pdal.kernels import cells, neighbours, parallel
 from loda_pdal.kernels.blocks import MOST_IN_BLOCK
 from loda_pdal.kernels.cells import CellList, build_cells, extent, middle_of, to_cell_frame
 from loda_pdal.kernels.neighbours import (
-    count_neighbours,
     k_nearest,
     knn,
     mean_distances,
     nearest,
-    radius_neighbours,
 )
 from loda_pdal.kernels.parallel import run_ranges, set_threads, thread_count
 
@@ -139,16 +137,6 @@ def test_nearest_by_hand() -> None:
     assert np.allclose(distance, [0.1, 1.0, np.inf])
 
 
-@pytest.mark.parametrize("radius", [0.3, 1.0, 4.0])
-def test_radius_neighbours_equal_brute_force(radius: float) -> None:
-    xyz = cloud()
-    found = radius_neighbours(xyz, radius)
-    sq = sq_distances(xyz, xyz)
-    for q in range(len(xyz)):
-        assert sorted(found.idx[found.starts[q] : found.starts[q + 1]]) == np.flatnonzero(sq[q] <= radius**2).tolist()
-    assert count_neighbours(xyz, radius).tolist() == (sq <= radius**2).sum(axis=1).tolist()
-
-
 def test_cell_size_does_not_change_the_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     xyz = cloud()
     expected = knn(xyz, 6)
@@ -171,7 +159,6 @@ def test_empty_clouds_have_no_neighbours() -> None:
     assert knn(none, 3).idx.shape == (0, 3)
     assert nearest(none, some)[0].tolist() == [-1, -1]
     assert nearest(some, none)[0].size == 0
-    assert radius_neighbours(none, 1.0, some).starts.tolist() == [0, 0, 0]
 
 
 def test_threads_do_not_change_the_answer(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -180,7 +167,7 @@ def test_threads_do_not_change_the_answer(monkeypatch: pytest.MonkeyPatch) -> No
     answers = []
     for n in (1, 3):
         set_threads(n)
-        answers.append((knn(xyz, 9).idx, *radius_neighbours(xyz, 0.5)))
+        answers.append((*knn(xyz, 9), mean_distances(xyz, 5)))
     set_threads(None)
     for one, three in zip(*answers, strict=True):
         assert np.array_equal(one, three)

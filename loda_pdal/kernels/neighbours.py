@@ -1,4 +1,4 @@
-"""Neighbours in space: k nearest neighbours, nearest point, all within a radius; by `cells` and `blocks`.
+"""Neighbours in space: k nearest neighbours, nearest point, mean distances; by `cells` and `blocks`.
 
 Ties go to the lower index, so results depend neither on the cell size nor on the number of threads.
 """
@@ -12,13 +12,9 @@ import numpy.typing as npt
 from numba import njit
 
 from loda_pdal.kernels.blocks import (
-    around,
     block_edge,
-    box_of,
     distance_to_far_corner,
-    hits_within,
     insert,
-    measure,
     nearest_of_block,
     run_blocks,
 )
@@ -26,7 +22,6 @@ from loda_pdal.kernels.cells import (
     CellList,
     Float32Array,
     FloatArray,
-    Int64Array,
     IntArray,
     build_cells,
     cells_between,
@@ -42,10 +37,8 @@ from loda_pdal.kernels.cells import (
 
 __all__ = [
     "CellList",
-    "NeighbourLists",
     "NeighbourTable",
     "build_cells",
-    "count_neighbours",
     "empty_runs",
     "k_nearest",
     "k_within",
@@ -53,7 +46,6 @@ __all__ = [
     "mean_distances",
     "middle_of",
     "nearest",
-    "radius_neighbours",
     "runs_within",
     "sq_distance",
     "to_cell_frame",
@@ -65,13 +57,6 @@ class NeighbourTable(NamedTuple):
 
     idx: IntArray
     distance: Float32Array
-
-
-class NeighbourLists(NamedTuple):
-    """Neighbours of query q are ``idx[starts[q]:starts[q + 1]]``, by column and height; int64 (q + 1,) and int32."""
-
-    starts: Int64Array
-    idx: IntArray
 
 
 def knn(
@@ -136,29 +121,6 @@ def mean_distances(xyz: npt.NDArray[Any], k: int) -> FloatArray:
     return mean
 
 
-def radius_neighbours(xyz: npt.NDArray[Any], radius: float, queries: npt.NDArray[Any] | None = None) -> NeighbourLists:
-    """All points of a cloud (n, 3) within ``radius``, m, of each query (q, 3), the cloud itself by default.
-
-    A point of the cloud is among its own neighbours.
-    """
-    cells = build_cells(xyz, max(radius, block_edge(xyz)))
-    asked = cells if queries is None else _like(cells, queries)
-    starts = np.zeros(len(asked.xyz) + 1, dtype=np.int64)
-    run_blocks(_count_range, asked, cells, float(radius), starts[1:])
-    np.cumsum(starts, out=starts)
-    idx = np.empty(starts[-1], dtype=np.int32)
-    run_blocks(_fill_range, asked, cells, float(radius), starts, idx)
-    return NeighbourLists(starts, idx)
-
-
-def count_neighbours(xyz: npt.NDArray[Any], radius: float) -> Int64Array:
-    """How many points of a cloud (n, 3) lie within ``radius``, m, of each of its points, itself included, (n,)."""
-    cells = build_cells(xyz, max(radius, block_edge(xyz)))
-    counts = np.zeros(len(xyz), dtype=np.int64)
-    run_blocks(_count_range, cells, cells, float(radius), counts)
-    return counts
-
-
 def _like(cells: CellList, queries: npt.NDArray[Any]) -> CellList:
     """Cell list of queries (q, 3), m, in the frame of another."""
     return build_cells(queries, cells.cell_m, cells.centre)
@@ -202,31 +164,6 @@ def _mean_distance_range(start, stop, room, blocks, cells, mean):  # type: ignor
                     total += np.float64(np.float32(np.sqrt(room.nearest_sq[row, j])))
                     n += 1
             mean[cells.idx[q]] = total / n
-    return stop
-
-
-@njit(nogil=True, cache=True)
-def _count_range(start, stop, room, blocks, queries, cells, radius, counts):  # type: ignore[no-untyped-def]
-    for block in range(start, stop):
-        n = around(room, cells, box_of(queries, blocks[block], blocks[block + 1]), radius)
-        if n < 0:
-            return block
-        for q in range(blocks[block], blocks[block + 1]):
-            measure(room, n, queries.xyz[q, 0], queries.xyz[q, 1], queries.xyz[q, 2])
-            counts[queries.idx[q]] = hits_within(room, n, radius * radius)
-    return stop
-
-
-@njit(nogil=True, cache=True)
-def _fill_range(start, stop, room, blocks, queries, cells, radius, starts, idx):  # type: ignore[no-untyped-def]
-    for block in range(start, stop):
-        n = around(room, cells, box_of(queries, blocks[block], blocks[block + 1]), radius)
-        if n < 0:
-            return block
-        for q in range(blocks[block], blocks[block + 1]):
-            measure(room, n, queries.xyz[q, 0], queries.xyz[q, 1], queries.xyz[q, 2])
-            for h in range(hits_within(room, n, radius * radius)):
-                idx[starts[queries.idx[q]] + h] = room.idx[room.hit[h]]
     return stop
 
 
