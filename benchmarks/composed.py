@@ -70,7 +70,51 @@ def exchanged(threads: int) -> Exchange:
         found = knn(xyz, 1, max_distance, queries)
         return found.idx[:, 0], found.distance[:, 0]
 
-    def fuse_points(xyz: Any, params: FuseParams) -> VoxelCloud:
+    def eigen_features(xyz: Any, height: Any, params: FeatureParams) -> features.Features:
+        names = ["linearity", "planarity", "sphericity", "nz", "nx", "ny"]
+        found = jakteristics.compute_features(
+            xyz, params.radius_m, num_threads=threads, feature_names=names, max_k_neighbors=1000
+        )
+        is_valid = np.isfinite(found).all(axis=1)
+        values = np.empty((len(xyz), 5), np.float32)
+        values[:, :4] = np.where(is_valid[:, None], np.abs(found[:, :4]), features.NO_SHAPE)
+        values[:, 4] = np.nan_to_num(height)
+        normals = np.where(is_valid[:, None], found[:, [4, 5, 3]] * np.where(found[:, 3:4] < 0, -1, 1), 0)
+        return features.Features(values, normals.astype(np.float32), is_valid)
+
+    def level_of_detection(before: Any, after: Any, covariance: Any, centre: Any, params: LodParams) -> LodGrid:
+        cells = np.unique(cells_of(np.vstack([before, after]), params.cell_m), axis=0)
+        sigma = float(np.sqrt(np.trace(covariance[:3, :3]) / 3))
+        core = (cells + 0.5) * params.cell_m
+        distance, limit, n, normal = other.m3c2_py4dgeo(before, after, core, params, sigma, threads)
+        is_valid = np.isfinite(limit) & (n.min(axis=1) >= params.min_points)
+        return LodGrid(
+            cells.astype(np.int32),
+            params.cell_m,
+            np.where(is_valid, limit, params.low_observability_m).astype(np.float32),
+            np.where(is_valid[:, None], normal, 0).astype(np.float32),
+            n[:, 0].astype(np.int32),
+            n[:, 1].astype(np.int32),
+            is_valid,
+            np.where(is_valid, distance, np.nan).astype(np.float32),
+            params.low_observability_m,
+        )
+
+    return {
+        fuse.fuse_survey: lambda survey, params: fuse_points(survey.xyz, params),
+        outliers.remove_outliers: remove_outliers,
+        registration.register: register,
+        lod.level_of_detection: level_of_detection,
+        features.eigen_features: eigen_features,
+        neighbours.knn: knn,
+        neighbours.nearest: nearest,
+        clusters.linked: linked,
+        clusters.dbscan: dbscan,
+        proxies.voxel_components: voxel_components,
+    }
+
+
+def fuse_points(xyz: Any, params: FuseParams) -> VoxelCloud:
     """Mean of each voxel, and the voxel of each point, by Open3D."""
     low = np.floor(xyz.min(axis=0) / params.leaf_m) * params.leaf_m
     cloud, _, traces = other.open3d_cloud(xyz).voxel_down_sample_and_trace(
