@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -146,10 +147,11 @@ def test_other_presets_show_no_change_in_a_survey_against_itself(block: Simulate
     assert found.ground_changes == []
 
 
-def test_point_order_and_threads_do_not_matter(block: SimulatedBlock, result: ChangeResult) -> None:
+@pytest.mark.parametrize("n_threads", [1, 4])
+def test_point_order_and_threads_do_not_matter(block: SimulatedBlock, result: ChangeResult, n_threads: int) -> None:
     rng = np.random.default_rng(0)
     order = [rng.permutation(len(side)) for side in block.surveys]
-    set_threads(1)
+    set_threads(n_threads)
     try:
         shuffled = detect_changes(survey(block.surveys.before.xyz[order[0]]), survey(block.surveys.after.xyz[order[1]]))
     finally:
@@ -159,6 +161,17 @@ def test_point_order_and_threads_do_not_matter(block: SimulatedBlock, result: Ch
             assert np.array_equal(left[own], right)
     for mine, yours in zip(result.objects, shuffled.objects, strict=True):
         assert replace(mine, footprint=None) == replace(yours, footprint=None)
+
+
+def test_two_runs_at_once_in_threads_of_somebody_else(block: SimulatedBlock, result: ChangeResult) -> None:
+    """As a scheduler of tiles would: each run makes threads of its own inside a thread that it was given."""
+    with ThreadPoolExecutor(2) as workers:
+        runs = [
+            workers.submit(detect_changes, *(survey(epoch.xyz) for epoch in block.surveys)),
+            workers.submit(detect_changes, *(survey(epoch.xyz) for epoch in block.surveys)),
+        ]
+        for run in runs:
+            same(result, run.result())
 
 
 def test_a_shift_of_the_whole_map_changes_nothing(block: SimulatedBlock, result: ChangeResult) -> None:
