@@ -11,6 +11,7 @@ import pytest
 from benchmarks import libraries as other
 from benchmarks.conftest import Measure
 from loda_pdal.model.pair import Pair
+from loda_pdal.model.survey import Survey
 from loda_pdal.model.transform import transform_points
 from loda_pdal.params import Parameters
 from loda_pdal.pipeline import fuse_epochs, register_epochs
@@ -22,7 +23,7 @@ P = Parameters()
 @pytest.fixture(scope="module")
 def registered(before: Any, after: Any) -> tuple[Any, Any, Any]:
     """Both epochs in the after frame, and the registration."""
-    found = register_epochs(fuse_epochs(Pair(before, after), P), P)
+    found = register_epochs(fuse_epochs(Pair(Survey(before), Survey(after)), P), P)
     return transform_points(found.T_after_before, before), after, found
 
 

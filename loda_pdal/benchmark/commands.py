@@ -187,6 +187,6 @@ def _compile_kernels() -> None:
     from loda_pdal.warmup import compile_kernels
 
     if not is_cache_warm():
-        click.echo("Compiling kernels, once: that takes about half a minute.", err=True)
+        click.echo("Compiling kernels, once: that takes about a minute.", err=True)
         with tempfile.TemporaryDirectory(prefix="loda-pdal-") as scratch:
             compile_kernels(Path(scratch))
