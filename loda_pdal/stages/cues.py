@@ -381,13 +381,15 @@ def _nearest_surface(surface: Surface, centre: FloatArray, reach_m: float) -> In
 def _displacement(surfaces: Pair[Surface], found: Pair[IntArray]) -> tuple[FloatArray, FloatArray]:
     """Mean normal (c, 3) of the nearest surface points and their offset (c,) m along it (equation 5)."""
     normal, displacement = np.zeros((len(found.before), 3)), np.full(len(found.before), np.nan)
-    is_both = (found.before >= 0) & (found.after >= 0)
+    is_measured = surfaces.join(
+        found, lambda surface, idx: np.append(surface.n_raw, 0)[idx] > 0
+    )  # filling is no surface
+    is_both = is_measured.before & is_measured.after
     b, a = found.before[is_both], found.after[is_both]
     n_b, n_a = surfaces.before.normals[b].astype(np.float64), surfaces.after.normals[a].astype(np.float64)
     n_a = np.where(np.sum(n_b * n_a, axis=1, keepdims=True) < 0, -n_a, n_a)
     mean = n_b + n_a
     length = np.linalg.norm(mean, axis=1, keepdims=True)
-    length[~(n_b.any(axis=1) & n_a.any(axis=1))] = 0.0
     mean = np.divide(mean, length, out=np.zeros_like(mean), where=length > 0.5)
     offset = np.sum(mean * (surfaces.after.xyz[a] - surfaces.before.xyz[b]), axis=1)
     normal[is_both] = mean
