@@ -36,7 +36,7 @@ from loda_pdal.stages.changes import Changes, decide_changes
 from loda_pdal.stages.correspondence import Objects, match_instances, owners
 from loda_pdal.stages.cues import Surface
 from loda_pdal.stages.features import Features, eigen_features
-from loda_pdal.stages.filling import fill_columns
+from loda_pdal.stages.filling import bodies, filled
 from loda_pdal.stages.fuse import fuse_survey
 from loda_pdal.stages.ground import GroundModel, ground_model, vertical_rotation
 from loda_pdal.stages.ground_changes import GroundChanges, ground_changes
@@ -243,19 +243,8 @@ def match_objects(
     descriptors = at_once(lambda cloud, g, i: _descriptors(cloud, g, i, p), clouds, ground, instances)
     proxy_pairs = None if proxies is None else (proxies.proxies.map(lambda side: side.proxy), proxies.matches)
     xyz = clouds.map(lambda cloud: cloud.xyz)
-    bodies = Pair(*(_bodies(*each, p) for each in zip(xyz, ground, instances, strict=True)))
-    return match_instances(xyz, instances, bodies, descriptors, proxy_pairs, p.changes.query_radius_m, p.association)
-
-
-def _bodies(xyz: FloatArray, ground: Ground, instances: Instances, p: Parameters) -> tuple[FloatArray, IntArray]:
-    """Points (k, 3) that say what space the instances take, and the instance (k,) of each."""
-    member = np.flatnonzero(instances.instance > 0)
-    points, instance = xyz[member], instances.instance[member]
-    if not p.changes.fills_buildings:
-        return points, instance
-    is_body = np.isin(instances.classification, (ObjectClass.BUILDING, ObjectClass.OTHER))
-    filling = fill_columns(xyz, ground.height, instances.instance - 1, is_body, p.changes.voxel_m)
-    return np.concatenate([points, filling.xyz]), np.concatenate([instance, instances.instance[filling.under]])
+    space = at_once(lambda cloud, g, i: bodies(cloud.xyz, g.height, i, p.changes), clouds, ground, instances)
+    return match_instances(xyz, instances, space, descriptors, proxy_pairs, p.changes.query_radius_m, p.association)
 
 
 def label_objects(
@@ -277,7 +266,7 @@ def label_objects(
     surfaces = at_once(surface, clouds, ground, segments, instances, owner)
     if p.changes.fills_buildings:
         is_body = np.append(objects.object_class == ObjectClass.BUILDING, False)
-        surfaces = surfaces.map(lambda side: filled(side, is_body[side.owner], p))
+        surfaces = at_once(lambda side: filled(side, is_body[side.owner], p.changes.voxel_m), surfaces)
     covered = at_once(lambda cloud: coverage(cloud.xyz, p.observability), clouds)
     changes = decide_changes(surfaces, objects.object_class, covered, lod, p.changes, p.observability, p.confidence)
     return replace(changes, owner=changes.owner.join(clouds, lambda own, cloud: own[: len(cloud)]))
@@ -385,20 +374,6 @@ _MOST_UNSEEN = 0.2
 def _outline_m(p: Parameters) -> float:
     """Resolution of outlines: the occupancy voxel."""
     return p.changes.voxel_m
-
-
-def filled(surface: Surface, is_building: BoolArray, p: Parameters) -> Surface:
-    """The surface with points under its roofs, behind its own."""
-    filling = fill_columns(surface.xyz, surface.height, surface.owner, is_building, p.changes.voxel_m)
-    n = len(filling.under)
-    return Surface(
-        xyz=np.concatenate([surface.xyz, filling.xyz]),
-        normals=np.concatenate([surface.normals, np.zeros((n, 3), dtype=np.float32)]),
-        height=np.concatenate([surface.height, np.full(n, np.nan)]),
-        n_raw=np.concatenate([surface.n_raw, np.zeros(n, dtype=surface.n_raw.dtype)]),
-        owner=np.concatenate([surface.owner, surface.owner[filling.under]]),
-        is_surface=np.concatenate([surface.is_surface, np.ones(n, np.bool_)]),
-    )
 
 
 def _descriptors(cloud: VoxelCloud, ground: Ground, instances: Instances, p: Parameters) -> Descriptors:

@@ -33,6 +33,9 @@ logger = logging.getLogger(__name__)
 COMPILING = "compiling kernels, once"
 """What progress says meanwhile."""
 
+NOTICE = "Compiling kernels, once: that takes about a minute."
+"""What is said before."""
+
 EPSG, PLACE = 28992, np.array([121_000.0, 487_000.0, 0.0])
 """Where the scene is said to be."""
 

@@ -13,12 +13,7 @@ import loda_pdal.kernels
 from loda_pdal.kernels import cells, neighbours, parallel
 from loda_pdal.kernels.blocks import MOST_IN_BLOCK
 from loda_pdal.kernels.cells import CellList, build_cells, extent, middle_of, to_cell_frame
-from loda_pdal.kernels.neighbours import (
-    k_nearest,
-    knn,
-    mean_distances,
-    nearest,
-)
+from loda_pdal.kernels.neighbours import k_nearest, knn, mean_distances, nearest
 from loda_pdal.kernels.parallel import run_ranges, set_threads, thread_count
 
 

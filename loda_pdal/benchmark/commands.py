@@ -184,9 +184,10 @@ def profile(
 def _compile_kernels() -> None:
     """Compile the kernels, and say so, where that has not been done."""
     from loda_pdal.kernels import is_cache_warm
-    from loda_pdal.warmup import compile_kernels
 
     if not is_cache_warm():
-        click.echo("Compiling kernels, once: that takes about a minute.", err=True)
+        from loda_pdal.warmup import NOTICE, compile_kernels
+
+        click.echo(NOTICE, err=True)
         with tempfile.TemporaryDirectory(prefix="loda-pdal-") as scratch:
             compile_kernels(Path(scratch))

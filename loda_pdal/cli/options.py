@@ -71,7 +71,7 @@ def compile_kernels(reporter: Reporter) -> Compiled | None:
         return None
     from loda_pdal import warmup
 
-    reporter.info("Compiling kernels, once: that takes about a minute.")
+    reporter.info(warmup.NOTICE)
     with tempfile.TemporaryDirectory(prefix="loda-pdal-") as folder:
         stopping.before_stopping(lambda: shutil.rmtree(folder, ignore_errors=True))
         return warmup.compile_kernels(Path(folder), reporter.progress)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from loda_pdal.kernels.neighbours import build_cells, empty_runs, runs_within, sq_distance
+from loda_pdal.kernels.cells import build_cells, empty_runs, runs_within, sq_distance
 from loda_pdal.kernels.parallel import run_ranges
 
 IntArray = npt.NDArray[np.int32]

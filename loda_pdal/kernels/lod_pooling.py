@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from loda_pdal.kernels.cells import empty_runs, runs_within, sq_distance
 from loda_pdal.kernels.geometry import eigen_symmetric_3x3
-from loda_pdal.kernels.neighbours import empty_runs, runs_within, sq_distance
 from loda_pdal.kernels.planes import LINE
 
 MAD_TO_STD = 1.4826

@@ -25,31 +25,11 @@ from loda_pdal.kernels.cells import (
     IntArray,
     build_cells,
     cells_between,
-    empty_runs,
     first_above,
     first_column,
-    middle_of,
-    runs_within,
     sq_distance,
     sq_gap_to_column,
-    to_cell_frame,
 )
-
-__all__ = [
-    "CellList",
-    "NeighbourTable",
-    "build_cells",
-    "empty_runs",
-    "k_nearest",
-    "k_within",
-    "knn",
-    "mean_distances",
-    "middle_of",
-    "nearest",
-    "runs_within",
-    "sq_distance",
-    "to_cell_frame",
-]
 
 
 class NeighbourTable(NamedTuple):

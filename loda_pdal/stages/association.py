@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from loda_pdal.kernels.clusters import components
 from loda_pdal.model.boxes import Boxes, box_iou, boxes_of
 from loda_pdal.model.cloud import FloatArray, Int64Array, IntArray
 from loda_pdal.model.groups import Groups, count_cells
@@ -212,9 +211,7 @@ def _optimal(i: Int64Array, j: Int64Array, gain: FloatArray) -> Int64Array:
     if len(i) == 0:
         return np.zeros(0, dtype=np.int64)
     n_rows = int(i.max()) + 1
-    size = n_rows + int(j.max()) + 1
-    graph = coo_array((np.ones(len(i), dtype=np.int8), (i, j + n_rows)), shape=(size, size))
-    component = connected_components(graph, directed=False)[1][i]
+    component = components(np.column_stack([i, j + n_rows]), n_rows + int(j.max()) + 1)[i]
     groups = Groups(component, int(component.max()) + 1)
     chosen = [_solved(groups.members(int(k)), i, j, gain) for k in np.flatnonzero(groups.counts)]
     return np.sort(np.concatenate(chosen))

@@ -381,9 +381,8 @@ def _nearest_surface(surface: Surface, centre: FloatArray, reach_m: float) -> In
 def _displacement(surfaces: Pair[Surface], found: Pair[IntArray]) -> tuple[FloatArray, FloatArray]:
     """Mean normal (c, 3) of the nearest surface points and their offset (c,) m along it (equation 5)."""
     normal, displacement = np.zeros((len(found.before), 3)), np.full(len(found.before), np.nan)
-    is_measured = surfaces.join(
-        found, lambda surface, idx: np.append(surface.n_raw, 0)[idx] > 0
-    )  # filling is no surface
+    # points filled in under roofs have no raw points, and are no surface that could have moved
+    is_measured = surfaces.join(found, lambda surface, idx: np.append(surface.n_raw, 0)[idx] > 0)
     is_both = is_measured.before & is_measured.after
     b, a = found.before[is_both], found.after[is_both]
     n_b, n_a = surfaces.before.normals[b].astype(np.float64), surfaces.after.normals[a].astype(np.float64)

@@ -21,7 +21,7 @@ from loda_pdal.kernels.alignment import (
     plane_blocks,
     plane_chunks,
 )
-from loda_pdal.kernels.neighbours import CellList, build_cells, to_cell_frame
+from loda_pdal.kernels.cells import CellList, build_cells, to_cell_frame
 from loda_pdal.kernels.parallel import run_ranges
 from loda_pdal.model.cloud import BoolArray, Float32Array, FloatArray, IntArray
 from loda_pdal.model.pair import Pair, at_once

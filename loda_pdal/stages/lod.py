@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from loda_pdal.kernels.cells import build_cells, middle_of, to_cell_frame
 from loda_pdal.kernels.lod_pooling import pool_range
-from loda_pdal.kernels.neighbours import build_cells, middle_of, to_cell_frame
 from loda_pdal.kernels.parallel import run_ranges
 from loda_pdal.model.cloud import FloatArray, Int64Array
 from loda_pdal.model.grid import cells_of

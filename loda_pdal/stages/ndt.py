@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from loda_pdal.kernels.alignment import CHUNK, N_SUMS, SCORE, distribution_chunks, sum_products
-from loda_pdal.kernels.neighbours import CellList, build_cells, to_cell_frame
+from loda_pdal.kernels.cells import CellList, build_cells, to_cell_frame
 from loda_pdal.kernels.parallel import run_ranges, thread_count
 from loda_pdal.model.cloud import BoolArray, Float32Array, FloatArray
 from loda_pdal.model.transform import IDENTITY, exp_se3, transform_points

@@ -7,10 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from loda_pdal.kernels.clusters import components
 from loda_pdal.model.boxes import upright_boxes
 from loda_pdal.model.cloud import BoolArray, Int64Array, IntArray
 from loda_pdal.model.grid import Lattice, cells_of
@@ -119,8 +118,7 @@ def _regions(
     # one tree for all objects: a fourth coordinate keeps them apart
     place = np.column_stack([cells.voxels.cell[members], owner[members].astype(np.int64) * 10])
     links = cKDTree(place).query_pairs(_LINK_VOXELS, output_type="ndarray")
-    graph = coo_array((np.ones(len(links), np.int8), (links[:, 0], links[:, 1])), shape=(len(members),) * 2)
-    region = connected_components(graph, directed=False)[1]
+    region = components(links, len(members))
     groups = Groups(region, int(region.max()) + 1)
     found = []
     for index in np.flatnonzero(groups.counts >= params.part_min_voxels).tolist():

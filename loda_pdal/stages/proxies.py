@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from loda_pdal.kernels.clusters import components
 from loda_pdal.kernels.shifted import find_shifted, spread
 from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array, IntArray
-from loda_pdal.model.groups import consecutive
 from loda_pdal.params import ProxyParams
 from loda_pdal.stages.association import Descriptors, describe
 
@@ -124,9 +122,7 @@ def _connected(keys: Int64Array, strides: Int64Array) -> IntArray:
         place = find_shifted(keys, np.dot(offset, strides))
         own.append(np.flatnonzero(place >= 0).astype(np.int32))
         other.append(place[own[-1]])
-    edges = (np.concatenate(own), np.concatenate(other))
-    graph = coo_array((np.ones(len(edges[0]), dtype=np.int8), edges), shape=(len(keys), len(keys)))
-    return consecutive(connected_components(graph, directed=False)[1])[0]
+    return components(np.column_stack([np.concatenate(own), np.concatenate(other)]), len(keys))
 
 
 _HALF_OF_26 = [(dx, dy, dz) for dx in (-1, 0, 1) for dy in (-1, 0, 1) for dz in (-1, 0, 1) if (dx, dy, dz) > (0, 0, 0)]

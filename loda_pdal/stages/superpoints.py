@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from loda_pdal.kernels.clusters import components
 from loda_pdal.kernels.neighbours import knn
 from loda_pdal.kernels.partition import (
     closest_neighbours,
@@ -18,7 +17,6 @@ from loda_pdal.kernels.partition import (
     symmetric_arcs,
 )
 from loda_pdal.model.cloud import Float32Array, FloatArray, IntArray
-from loda_pdal.model.groups import consecutive
 from loda_pdal.params import SuperpointParams
 from loda_pdal.stages.features import Features
 from loda_pdal.stages.partition import (
@@ -143,9 +141,8 @@ def absorb_small(regions: Regions, features: Float32Array, least_size: int) -> R
         small = np.flatnonzero(neighbour >= 0)
         if len(small) == 0:
             return regions
-        joins = coo_array((np.ones(len(small), np.int8), (small, neighbour[small])), shape=(len(regions),) * 2)
-        group, n_groups = consecutive(connected_components(joins, directed=False)[1])
-        regions = regrouped(regions, group, n_groups, features)
+        group = components(np.column_stack([small, neighbour[small]]), len(regions))
+        regions = regrouped(regions, group, int(group.max()) + 1, features)
 
 
 def _lower_median(values: Float32Array) -> float:

@@ -262,7 +262,7 @@ def _move_vehicle(ledger: Ledger) -> None:
         )
 
 
-def _replace_vehicle(ledger: Ledger) -> None:
+def replace_vehicle(ledger: Ledger) -> None:
     """A vehicle makes room for one of another build in the same slot."""
     placed = ledger.take(ledger.street.cars)
     if placed is not None:
@@ -329,7 +329,7 @@ _EDITS: dict[str, Callable[[Ledger], None]] = {
     "vehicle_added": _add_vehicle,
     "vehicle_removed": _remove_vehicle,
     "vehicle_moved": _move_vehicle,
-    "vehicle_replaced": _replace_vehicle,
+    "vehicle_replaced": replace_vehicle,
     "vehicle_reparked": _repark_vehicle,
     "furniture_added": _add_furniture,
     "furniture_removed": _remove_furniture,

@@ -130,23 +130,31 @@ class Terrain:
         half = [0.0, 1.4, ROAD_HALF_M, 3.9, KERB_Y_M, KERB_Y_M + 0.02, 6.0, PAVEMENT_END_M, PAVEMENT_END_M + 0.3, 8.7]
         half += np.arange(FACADE_Y_M, far, 2.0).tolist()
         ys = {*half, *(-y for y in half)}
-        for p in outlines:
-            xs |= {p.x0, p.x0 + p.rim, p.x1 - p.rim, p.x1}
-            ys |= {p.y0, p.y0 + p.rim, p.y1 - p.rim, p.y1}
-        grid_x, grid_y = np.meshgrid(sorted(xs), sorted(ys), indexing="ij")
-        grid_z = self.height(grid_x, grid_y) + sum((p.rise(grid_x, grid_y) for p in patches), np.zeros(grid_x.shape))
-        nodes = np.stack([grid_x, grid_y, grid_z], axis=2)
-        a, b, c, d = nodes[:-1, :-1], nodes[1:, :-1], nodes[1:, 1:], nodes[:-1, 1:]
-        triangles = np.concatenate([np.stack([a, b, c], axis=2), np.stack([a, c, d], axis=2)]).reshape(-1, 3, 3)
-        middle = triangles.mean(axis=1)
-        across = np.abs(middle[:, 1])
+        triangles, owner = mesh(self, xs, ys, patches, outlines)
+        across = np.abs(triangles.mean(axis=1)[:, 1])
         zones = [across < KERB_Y_M, across < PAVEMENT_END_M]
         material = np.select(zones, [Material.ASPHALT, Material.PAVING], Material.GRASS)
-        owner = np.full(len(triangles), -1)
-        for i, p in enumerate(outlines):
-            owner[p.contains(middle[:, 0], middle[:, 1])] = i
         shape = replace(of_triangles(triangles, Material.GRASS), triangle_material=material.astype(np.uint8))
         return shape, owner
+
+
+def mesh(
+    ground: Ground, xs: set[float], ys: set[float], patches: list[GroundPatch], outlines: list[GroundPatch]
+) -> tuple[FloatArray, Int64Array]:
+    """Triangles (t, 3, 3) of a ground over lines at ``xs`` and ``ys`` (m) and along the rims of all outlines, with
+    ``patches`` applied, and for each which of the outlines it lies in (-1 none)."""
+    rims = [[(p.x0, p.y0), (p.x0 + p.rim, p.y0 + p.rim), (p.x1 - p.rim, p.y1 - p.rim), (p.x1, p.y1)] for p in outlines]
+    xs, ys = xs.union(x for rim in rims for x, _ in rim), ys.union(y for rim in rims for _, y in rim)
+    x, y = np.meshgrid(sorted(xs), sorted(ys), indexing="ij")
+    z = ground.height(x, y) + sum((p.rise(x, y) for p in patches), np.zeros(x.shape))
+    nodes = np.stack([x, y, z], axis=2)
+    a, b, c, d = nodes[:-1, :-1], nodes[1:, :-1], nodes[1:, 1:], nodes[:-1, 1:]
+    triangles = np.concatenate([np.stack([a, b, c], axis=2), np.stack([a, c, d], axis=2)]).reshape(-1, 3, 3)
+    middle = triangles.mean(axis=1)
+    owner = np.full(len(triangles), -1)
+    for i, p in enumerate(outlines):
+        owner[p.contains(middle[:, 0], middle[:, 1])] = i
+    return triangles, owner
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,10 @@ from loda_pdal.benchmark.simulate.edits import (
     GroundItem,
     Item,
     Ledger,
+    replace_vehicle,
 )
 from loda_pdal.benchmark.simulate.objects import FOUNDATION_M, Bush, Fence, Hedge, LampPost, Shed, Tree
-from loda_pdal.benchmark.simulate.scene import GroundPatch, Placed, draw_car, draw_tree
+from loda_pdal.benchmark.simulate.scene import GroundPatch, Placed, draw_car, draw_tree, mesh
 from loda_pdal.benchmark.simulate.shapes import Material, Shape, box, joined, of_triangles
 from loda_pdal.model.cloud import FloatArray, Int64Array
 from loda_pdal.model.errors import InputError
@@ -112,19 +113,9 @@ class TownTerrain:
         margin, reach = 45.0, self.half_width + 45.0
         xs = set(np.arange(-margin, self.length + margin + 0.5, 2.0).tolist())
         ys = set(np.arange(-reach, reach + 0.5, 2.0).tolist())
-        for p in outlines:
-            xs |= {p.x0, p.x0 + p.rim, p.x1 - p.rim, p.x1}
-            ys |= {p.y0, p.y0 + p.rim, p.y1 - p.rim, p.y1}
-        x, y = np.meshgrid(sorted(xs), sorted(ys), indexing="ij")
-        z = self.height(x, y) + sum((p.rise(x, y) for p in patches), np.zeros(x.shape))
-        nodes = np.stack([x, y, z], axis=2)
-        a, b, c, d = nodes[:-1, :-1], nodes[1:, :-1], nodes[1:, 1:], nodes[:-1, 1:]
-        triangles = np.concatenate([np.stack([a, b, c], axis=2), np.stack([a, c, d], axis=2)]).reshape(-1, 3, 3)
-        middle = triangles.mean(axis=1)
-        material = np.where(np.abs(middle[:, 1]) < 5.0, Material.ASPHALT, Material.GRASS).astype(np.uint8)
-        owner = np.full(len(triangles), -1)
-        for i, p in enumerate(outlines):
-            owner[p.contains(middle[:, 0], middle[:, 1])] = i
+        triangles, owner = mesh(self, xs, ys, patches, outlines)
+        is_road = np.abs(triangles.mean(axis=1)[:, 1]) < 5.0
+        material = np.where(is_road, Material.ASPHALT, Material.GRASS).astype(np.uint8)
         return replace(of_triangles(triangles, Material.GRASS), triangle_material=material), owner
 
 
@@ -464,14 +455,6 @@ def _move_car(ledger: Ledger) -> None:
         ledger.add_pair(placed, replace(slot, thing=placed.thing), "vehicle moved", "parked elsewhere")
 
 
-def _replace_car(ledger: Ledger) -> None:
-    if placed := ledger.take(ledger.street.cars):
-        others = ("hatchback", "saloon") if placed.thing.style in ("van", "suv", "estate") else ("van",)
-        after = replace(placed, thing=draw_car(ledger.random, others), x=placed.x + ledger.random.normal(0, 0.3))
-        note = f"{placed.thing.style} replaced by {after.thing.style} in the same slot"
-        ledger.add_pair(placed, after, "vehicle replaced", note)
-
-
 def _scale_tree(low: float, high: float) -> Callable[[Ledger], None]:
     def edit(ledger: Ledger) -> None:
         inside = _is_inside(ledger.street, 2.0)
@@ -525,7 +508,7 @@ _EDITS: tuple[tuple[Callable[[Ledger], None], int, int], ...] = (
     (_add("slots", "vehicle"), 1, 3),
     (_remove("cars", "vehicle"), 1, 3),
     (_move_car, 0, 1),
-    (_replace_car, 1, 1),
+    (replace_vehicle, 1, 1),
     (_change_ground, 1, 2),
 )
 """Each kind of edit with the fewest and the most of it per block."""
