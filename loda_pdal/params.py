@@ -336,6 +336,21 @@ class InstanceParams(StageParams):
         0.6, "parts of one building lie closer than this", unit="m", low=0.1, high=10, is_length=True
     )
     building_min_voxels: int = param(40, "fewer fused points are no building", low=1, high=100000)
+    roof_step_m: float = param(
+        0.0, "rows of buildings are cut where the roof steps by this much; 0: never", unit="m", low=0, high=20
+    )
+    annex_gap_m: float = param(
+        0.0,
+        "what stands as high as a building and in plan closer to one than this is part of it, however much lower; "
+        "0: never",
+        unit="m",
+        low=0,
+        high=10,
+        is_length=True,
+    )
+    roof_least_m2: float = param(
+        25.0, "smaller pieces of a cut row join the neighbour they border most on", unit="m2", low=0, high=10000
+    )
     cluster_radius_m: float = param(
         0.8, "smallest clustering radius of vegetation", unit="m", low=0.1, high=10, is_length=True
     )
@@ -435,6 +450,14 @@ class ChangeParams(StageParams):
         15.0, "only objects longer than this are looked through for parts", unit="m", low=0, high=1000
     )
     part_min_voxels: int = param(24, "occupancy voxels of the smallest part", low=1, high=10000)
+    part_min_width_m: float = param(
+        0.0,
+        "a part is at least this wide in plan: edges of roofs that the surveys sampled differently do not",
+        unit="m",
+        low=0,
+        high=10,
+        is_length=True,
+    )
     part_is_new_m3: float = param(
         80.0,
         "a part of a building that only one survey has, and as large as this, is a building that was Added or Removed",
@@ -445,6 +468,26 @@ class ChangeParams(StageParams):
     fills_buildings: bool = param(
         False, "buildings fill the space beneath their roofs: airborne surveys hardly see walls"
     )
+    body_voxel_m: float = param(
+        0.5,
+        "occupancy voxel of filled buildings: the roof is a surface, and a smaller voxel is not noisier as in a crown",
+        unit="m",
+        low=0.05,
+        high=10,
+        is_length=True,
+    )
+    body_query_radius_m: float = param(
+        0.75,
+        "largest distance of a filled building's voxel to the nearest surface point",
+        unit="m",
+        low=0.05,
+        high=10,
+        is_length=True,
+    )
+
+    def for_bodies(self) -> ChangeParams:
+        """The parameters for buildings that are filled."""
+        return replace(self, voxel_m=self.body_voxel_m, query_radius_m=self.body_query_radius_m)
 
 
 @dataclass(frozen=True)
@@ -689,6 +732,8 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
         "semantics": {"building_rmse_m": 0.15, "vegetation_sphericity": 0.15},
         "instances": {
             "building_gap_m": 1.2,
+            "roof_step_m": 1.0,
+            "annex_gap_m": 0.6,
             "cluster_radius_m": 1.2,
             "patch_min_points": 30,
             "vegetation_min_points": 15,
@@ -704,8 +749,10 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "min_samples": 20,
             "min_expected_points": 0.0,
             "volume_sigmas": 3.0,
+            "backing_voxels": 4,
             "vegetation_height_m": 0.8,
             "fills_buildings": True,
+            "part_min_width_m": 1.5,
         },
         "observability": {"cell_m": 2.0},
     },

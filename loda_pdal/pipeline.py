@@ -30,13 +30,13 @@ from loda_pdal.model.records import (
 from loda_pdal.model.registration import Registration
 from loda_pdal.model.survey import Survey
 from loda_pdal.model.transform import transform_points
-from loda_pdal.params import Parameters
+from loda_pdal.params import ChangeParams, Parameters
 from loda_pdal.stages.association import Descriptors, Matches, associate, describe
 from loda_pdal.stages.changes import Changes, decide_changes
 from loda_pdal.stages.correspondence import Objects, match_instances, owners
 from loda_pdal.stages.cues import Surface
 from loda_pdal.stages.features import Features, eigen_features
-from loda_pdal.stages.filling import bodies, filled
+from loda_pdal.stages.filling import bodies, filled, filled_everywhere
 from loda_pdal.stages.fuse import fuse_survey
 from loda_pdal.stages.ground import GroundModel, ground_model, vertical_rotation
 from loda_pdal.stages.ground_changes import GroundChanges, ground_changes
@@ -264,12 +264,22 @@ def label_objects(
         return Surface(cloud.xyz, s.features.normals, g.height, cloud.n_raw, own, is_surface)
 
     surfaces = at_once(surface, clouds, ground, segments, instances, owner)
-    if p.changes.fills_buildings:
-        is_body = np.append(objects.object_class == ObjectClass.BUILDING, False)
-        surfaces = at_once(lambda side: filled(side, is_body[side.owner], p.changes.voxel_m), surfaces)
     covered = at_once(lambda cloud: coverage(cloud.xyz, p.observability), clouds)
-    changes = decide_changes(surfaces, objects.object_class, covered, lod, p.changes, p.observability, p.confidence)
-    return replace(changes, owner=changes.owner.join(clouds, lambda own, cloud: own[: len(cloud)]))
+
+    def decide(sides: Pair[Surface], params: ChangeParams) -> Changes:
+        found = decide_changes(sides, objects.object_class, covered, lod, params, p.observability, p.confidence)
+        return replace(found, owner=found.owner.join(clouds, lambda own, cloud: own[: len(cloud)]))
+
+    if not p.changes.fills_buildings:
+        return decide(surfaces, p.changes)
+    # buildings as bodies on a finer lattice, then everything else, beside which the buildings stand as bodies too
+    is_building = np.append(objects.object_class == ObjectClass.BUILDING, False)
+    step_m = p.changes.body_voxel_m
+    buildings = surfaces.map(lambda side: side.only(is_building[side.owner]))
+    of_buildings = decide(at_once(lambda side: filled_everywhere(side, step_m), buildings), p.changes.for_bodies())
+    with_bodies = at_once(lambda side: filled(side, is_building[side.owner], step_m), surfaces)
+    of_others = decide(with_bodies.map(lambda side: side.only(~is_building[side.owner])), p.changes)
+    return of_buildings.together(of_others, clouds.map(lambda cloud: cloud.xyz))
 
 
 def compare_ground(clouds: Pair[VoxelCloud], instances: Pair[Instances], lod: LodGrid, p: Parameters) -> GroundChanges:

@@ -21,7 +21,7 @@ from loda_pdal.stages.confidence import calibrated, raw_confidence
 from loda_pdal.stages.correspondence import rank_by_place
 from loda_pdal.stages.cues import Evidence, Surface, Voxels, cells_with_owners, sample_voxels, weigh
 from loda_pdal.stages.observability import Coverage
-from loda_pdal.stages.parts import Parts, dissolve, split_parts
+from loda_pdal.stages.parts import Parts, dissolve, largest_regions, split_parts
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,26 @@ class Changes:
     def __len__(self) -> int:
         return len(self.label)
 
+    def together(self, other: Changes, xyz: Pair[FloatArray]) -> Changes:
+        """These objects and those of ``other``, which have none of the same points (m, 3) m, numbered by place."""
+        n = len(self)
+        owner = self.owner.join(other.owner, lambda own, more: np.where(more >= 0, more + n, own).astype(np.int32))
+        rank = rank_by_place(xyz, owner, n + len(other))
+        order = np.argsort(rank)
+        number = np.append(rank, -1).astype(np.int32)
+        parent = np.concatenate([self.parent, np.where(other.parent >= 0, other.parent + n, -1)])
+        both = self.evidence.together(other.evidence)
+        return Changes(
+            owner=owner.map(lambda side: number[side]),
+            parent=number[parent[order]],
+            object_class=np.concatenate([self.object_class, other.object_class])[order],
+            label=np.concatenate([self.label, other.label])[order],
+            confidence=np.concatenate([self.confidence, other.confidence])[order],
+            confidence_raw=np.concatenate([self.confidence_raw, other.confidence_raw])[order],
+            reason=tuple((self.reason + other.reason)[i] for i in order.tolist()),
+            evidence=both.at(order),
+        )
+
 
 def decide_changes(
     surfaces: Pair[Surface],
@@ -85,7 +105,8 @@ def decide_changes(
     cast = _Cast(surfaces, object_class, np.full(n, -1, dtype=np.int32), np.zeros(n, np.bool_)).settled(voxels)
     cells = cells_with_owners(voxels, cast.surfaces, len(cast), params)
     evidence = weigh(cells, cast.surfaces, len(cast), params)
-    is_no_pair = np.array([_is_no_pair(cue, params) for cue in _rows(evidence, cast.object_class)], dtype=np.bool_)
+    regions = largest_regions(cells, len(cast), params)
+    is_no_pair = np.array([_is_no_pair(cue, params) for cue in _rows(evidence, cast.object_class, regions)], np.bool_)
     if is_no_pair.any():
         cast = cast.without_pairs(is_no_pair).settled(voxels)
         cells = cells_with_owners(voxels, cast.surfaces, len(cast), params)
@@ -93,8 +114,9 @@ def decide_changes(
         cast = cast.with_parts(split_parts(cells, cast.surfaces, len(cast), params)).settled(voxels)
         cells = cells_with_owners(voxels, cast.surfaces, len(cast), params)
     evidence = weigh(cells, cast.surfaces, len(cast), params)
+    regions = largest_regions(cells, len(cast), params)
     surfaces, object_class, parent, is_apart = cast.surfaces, cast.object_class, cast.parent, cast.is_apart
-    cues = _rows(evidence, object_class)
+    cues = _rows(evidence, object_class, regions)
     verdicts = [
         _verdict(cue, apart, part, params, observability)
         for cue, apart, part in zip(cues, is_apart.tolist(), (parent >= 0).tolist(), strict=True)
@@ -210,6 +232,8 @@ class Cue(NamedTuple):
     n_voxels: float
     volume_before: float
     volume_after: float
+    cut_m3: float
+    grown_m3: float
 
 
 class Verdict(NamedTuple):
@@ -219,15 +243,16 @@ class Verdict(NamedTuple):
     reason: str
 
 
-def _rows(evidence: Evidence, object_class: ByteArray) -> list[Cue]:
+def _rows(evidence: Evidence, object_class: ByteArray, regions: Pair[FloatArray]) -> list[Cue]:
     columns = (
         evidence.n_voxels.before > 0,
         evidence.n_voxels.after > 0,
         evidence.support.before,
         evidence.support.after,
-        *(getattr(evidence, name) for name in Cue._fields[5:-3]),
+        *(getattr(evidence, name) for name in Cue._fields[5:-5]),
         np.fmax(evidence.n_voxels.before, evidence.n_voxels.after),
         *evidence.volume,
+        *regions,
     )
     return [
         Cue(ObjectClass(code), *values)
@@ -259,7 +284,8 @@ def _verdict(
 ) -> Verdict:
     """Label of one object; ``is_apart``: it was matched, but the pair turned out to be two objects."""
     if not (cue.is_before and cue.is_after):
-        return _unmatched(cue, is_apart, params, observability)
+        verdict = _unmatched(cue, is_apart, params, observability)
+        return _part_alone(cue, verdict, params) if is_part and cue.object_class == ObjectClass.BUILDING else verdict
     if observability.is_enabled and cue.observability < observability.min_observability:
         return Verdict(
             ChangeLabel.UNDETERMINED,
@@ -273,19 +299,37 @@ def _verdict(
     return _pair(cue, params)
 
 
+def _part_alone(cue: Cue, verdict: Verdict, params: ChangeParams) -> Verdict:
+    """A part of a building that one survey alone shows is growth or loss of the building, unless it is as large as one."""
+    volume = max(cue.volume_before, cue.volume_after)
+    if params.part_is_new_m3 == 0 or volume >= params.part_is_new_m3:
+        return verdict
+    if verdict.label == ChangeLabel.ADDED:
+        return Verdict(ChangeLabel.INCREASED, f"{volume:.0f} m3 built on: {verdict.reason}")
+    if verdict.label == ChangeLabel.REMOVED:
+        return Verdict(ChangeLabel.DECREASED, f"{volume:.0f} m3 taken away: {verdict.reason}")
+    return verdict
+
+
 def _new_part(cue: Cue, params: ChangeParams) -> Verdict | None:
     """A part as large as a building where the other survey has next to nothing: one house of a row came or went."""
-    large, small = max(cue.volume_before, cue.volume_after), min(cue.volume_before, cue.volume_after)
-    if params.part_is_new_m3 == 0 or large < params.part_is_new_m3 or small > _NEXT_TO_NOTHING * large:
+    large = max(cue.volume_before, cue.volume_after)
+    if params.part_is_new_m3 == 0 or large < params.part_is_new_m3:
         return None
-    label, other = (
-        (ChangeLabel.ADDED, "before") if cue.volume_after > cue.volume_before else (ChangeLabel.REMOVED, "after")
-    )
-    return Verdict(label, f"{large:.0f} m3 of building in a row, of which the {other} survey shows {small:.0f} m3")
+    for label, own, volume, other in (
+        (ChangeLabel.ADDED, cue.gained, cue.volume_after, "before"),
+        (ChangeLabel.REMOVED, cue.lost, cue.volume_before, "after"),
+    ):
+        shown = volume - own * params.voxel_m**3
+        if volume == large and shown <= _NEXT_TO_NOTHING * large:
+            return Verdict(
+                label, f"{large:.0f} m3 of building in a row, of which the {other} survey shows {shown:.0f} m3"
+            )
+    return None
 
 
-_NEXT_TO_NOTHING = 0.2
-"""Share of a part's volume that may be its neighbours' walls."""
+_NEXT_TO_NOTHING = 0.4
+"""Share of a part's volume that may lie within reach of its neighbours."""
 
 
 def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: ObservabilityParams) -> Verdict:
@@ -335,17 +379,20 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
     gate = params.lod_factor * cue.lod95 if params.use_lod else 0.0
     least = params.backing_voxels
     least_above = max(least, params.backing_share * cue.n_voxels)
-    has_height = params.use_height and abs(cue.dh) > max(gate, height_m)  # NaN is never above
+    dh = cue.dh
+    if params.fills_buildings and cue.object_class == ObjectClass.BUILDING and abs(cue.column_rise) > abs(dh):
+        dh = cue.column_rise  # most of the roof moved, if not its highest part
+    has_height = params.use_height and abs(dh) > max(gate, height_m)  # NaN is never above
     has_volume = params.use_volume and abs(cue.dv_ratio) > ratio
     is_raised = least == 0 or cue.gained_above >= least_above or cue.column_rise > height_m / 2
     is_lowered = least == 0 or cue.lost_above >= least_above or cue.column_rise < -height_m / 2
-    rises = has_height and cue.dh > 0 and is_raised
-    sinks = has_height and cue.dh < 0 and is_lowered
+    rises = has_height and dh > 0 and is_raised
+    sinks = has_height and dh < 0 and is_lowered
     noise = params.volume_sigmas * math.sqrt(cue.gained + cue.lost)
     has_volume = has_volume and abs(cue.gained - cue.lost) >= noise
     swells = has_volume and cue.dv_ratio > 0 and (least == 0 or cue.gained >= max(least, cue.lost))
     shrinks = has_volume and cue.dv_ratio < 0 and (least == 0 or cue.lost >= max(least, cue.gained))
-    figures = _figures(cue, height_m, ratio, gate)
+    figures = _figures(cue, dh, height_m, ratio, gate)
     if (rises or swells) and (sinks or shrinks):
         if math.isnan(cue.rise) or cue.rise == 0:
             return Verdict(
@@ -357,6 +404,10 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
         return Verdict(ChangeLabel.INCREASED, f"{_named(rises, swells)} up: {figures}")
     if sinks or shrinks:
         return Verdict(ChangeLabel.DECREASED, f"{_named(sinks, shrinks)} down: {figures}")
+    if cue.object_class == ObjectClass.BUILDING and max(cue.grown_m3, cue.cut_m3) > 0:
+        if cue.grown_m3 >= cue.cut_m3:
+            return Verdict(ChangeLabel.INCREASED, f"{cue.grown_m3:.0f} m3 built on in one piece: {figures}")
+        return Verdict(ChangeLabel.DECREASED, f"{cue.cut_m3:.0f} m3 taken away in one piece: {figures}")
     limit = max(gate, params.displacement_m)
     if params.use_displacement and params.displacement_m > 0 and not is_green and abs(cue.d_perp) > limit:
         label = ChangeLabel.INCREASED if cue.gained >= cue.lost else ChangeLabel.DECREASED
@@ -370,10 +421,10 @@ def _named(is_height: bool, is_volume: bool) -> str:
     return "height and volume" if is_height and is_volume else "height" if is_height else "volume"
 
 
-def _figures(cue: Cue, height_m: float, ratio: float, gate: float) -> str:
+def _figures(cue: Cue, dh: float, height_m: float, ratio: float, gate: float) -> str:
     parts = []
-    if not math.isnan(cue.dh):
-        parts.append(f"top {cue.dh:+.2f} m (limit {max(height_m, gate):.2f} m)")
+    if not math.isnan(dh):
+        parts.append(f"top {dh:+.2f} m (limit {max(height_m, gate):.2f} m)")
     if not math.isnan(cue.dv_ratio):
         parts.append(f"volume {cue.dv_ratio:+.0%} (limit {ratio:.0%})")
     if not math.isnan(cue.lod95):

@@ -6,7 +6,8 @@ reach and saw the place. Whose a voxel is changes while pairs are undone and par
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -54,6 +55,10 @@ class Surface:
     def owned_by(self, owner: IntArray) -> Surface:
         """The same points with other owners (m,)."""
         return replace(self, owner=owner)
+
+    def only(self, is_kept: BoolArray) -> Surface:
+        """The same points, with an owner only where ``is_kept`` (m,)."""
+        return self.owned_by(np.where(is_kept, self.owner, -1).astype(np.int32))
 
 
 @dataclass(frozen=True)
@@ -138,11 +143,14 @@ class Cells:
         Object whose points occupy the voxel in that epoch, -1 where none.
     is_seen : Pair of (c,) bool
         Whether that epoch saw the voxel's column, and would have hit what the other epoch shows there.
+    is_measured : Pair of (c,) bool
+        Whether that epoch's owner has raw points there: not in what was filled in beneath a roof.
     """
 
     voxels: Voxels
     owner: Pair[IntArray]
     is_seen: Pair[BoolArray]
+    is_measured: Pair[BoolArray]
 
     @property
     def is_near(self) -> Pair[BoolArray]:
@@ -178,7 +186,7 @@ class Evidence:
     height : Pair, m
         95th percentile of height above the ground of each epoch.
     support : Pair
-        Share of an epoch's voxels that the other epoch shows too.
+        Share of an epoch's voxels with raw points that the other epoch shows too.
     gained, lost
         Voxels that only the after, or only the before epoch has, where the other could have seen them;
         ``gained_above`` and ``lost_above`` are those beyond the other epoch's top.
@@ -218,6 +226,26 @@ class Evidence:
     observability: FloatArray
     rise: FloatArray
 
+    def at(self, index: Int64Array) -> Evidence:
+        """The cues of the objects ``index`` (k,)."""
+        return self._of_each(lambda values: values[index])
+
+    def together(self, other: Evidence) -> Evidence:
+        """The cues of these objects, then of those of ``other``."""
+        pairs = {item.name: (getattr(self, item.name), getattr(other, item.name)) for item in fields(self)}
+        return Evidence(
+            **{
+                name: own.join(more, _concatenated) if isinstance(own, Pair) else _concatenated(own, more)
+                for name, (own, more) in pairs.items()
+            }
+        )
+
+    def _of_each(self, change: Callable[[FloatArray], FloatArray]) -> Evidence:
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        return Evidence(
+            **{name: side.map(change) if isinstance(side, Pair) else change(side) for name, side in values.items()}
+        )
+
 
 def sample_voxels(
     surfaces: Pair[Surface], coverage: Pair[Coverage] | None, lod: LodGrid, params: ChangeParams
@@ -251,6 +279,10 @@ def sample_voxels(
     )
 
 
+def _concatenated(first: FloatArray, second: FloatArray) -> FloatArray:
+    return np.concatenate([first, second])
+
+
 def cells_with_owners(voxels: Voxels, surfaces: Pair[Surface], n: int, params: ChangeParams) -> Cells:
     """The voxels with their owners among objects 0 to ``n - 1``."""
     holder, points = voxels.holders(surfaces, n)
@@ -259,7 +291,7 @@ def cells_with_owners(voxels: Voxels, surfaces: Pair[Surface], n: int, params: C
     if params.min_expected_points > 0:
         expected = _expected_points(owner, n_raw, n)
         is_seen = is_seen.join(expected, lambda seen, points: seen & (points >= params.min_expected_points))
-    return Cells(voxels, owner, is_seen)
+    return Cells(voxels, owner, is_seen, n_raw.map(lambda points: points > 0))
 
 
 def _slots(cells: Pair[Int64Array]) -> tuple[Int64Array, Int64Array, Int64Array, Int64Array]:
@@ -303,9 +335,10 @@ def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -
     )
     n_voxels = own.map(lambda side: _count(side, side >= 0, n))
     n_known = own.join(is_known, lambda side, known: _count(side, known, n))
+    n_measured = own.join(cells.is_measured, lambda side, measured: _count(side, measured, n))
     n_shared = Pair(
-        _count(own.before, cells.is_near.after, n),
-        _count(own.after, cells.is_near.before, n),
+        _count(own.before, cells.is_measured.before & cells.is_near.after, n),
+        _count(own.after, cells.is_measured.after & cells.is_near.before, n),
     )
     gained, lost = _count(own.after, cells.is_gained, n), _count(own.before, cells.is_lost, n)
     voxel, owner = _either(cells)
@@ -337,7 +370,7 @@ def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -
         n_voxels=n_voxels,
         volume=volume,
         height=height,
-        support=n_shared.join(n_voxels, lambda shared, count: shared / np.maximum(count, 1)),
+        support=n_shared.join(n_measured, lambda shared, count: shared / np.maximum(count, 1)),
         gained=gained,
         lost=lost,
         iou=iou,

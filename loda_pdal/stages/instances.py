@@ -13,7 +13,8 @@ from loda_pdal.kernels.parallel import run_ranges
 from loda_pdal.kernels.rasters import highest_range
 from loda_pdal.model.boxes import upright_boxes
 from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, Int64Array, IntArray
-from loda_pdal.model.groups import Groups, consecutive
+from loda_pdal.model.grid import Lattice
+from loda_pdal.model.groups import Groups, consecutive, count_cells
 from loda_pdal.model.labels import ObjectClass
 from loda_pdal.params import InstanceParams, SemanticParams
 from loda_pdal.stages.semantics import Semantics, fit_planes, voxel_volume
@@ -96,6 +97,8 @@ def form_instances(
         classes.append(np.full(n, code, dtype=np.uint8))
         n_so_far += n
     object_class = np.concatenate(classes)
+    if params.annex_gap_m > 0:
+        label, object_class = _with_annexes(xyz, height, label, object_class, params, rules)
     is_member = label >= 0
     classification[is_member] = object_class[label[is_member]]
     return Instances((label + 1).astype(np.int32), object_class, classification)
@@ -123,7 +126,107 @@ def _buildings_by_contact(
     members = np.flatnonzero(is_building | held[semantics.segment] & (classification != ObjectClass.GROUND))
     label = np.full(len(xyz), -1, dtype=np.int32)
     label[members] = euclidean_clusters(xyz[members], params.building_gap_m)
+    if params.roof_step_m > 0:
+        cell_m = params.building_gap_m / 2
+        label[members] = split_at_steps(
+            xyz[members], label[members], cell_m, params.roof_step_m, params.roof_least_m2 / cell_m**2
+        )
     return _without_small(label, params.building_min_voxels)
+
+
+def _with_annexes(
+    xyz: FloatArray,
+    height: FloatArray,
+    label: IntArray,
+    object_class: ByteArray,
+    params: InstanceParams,
+    rules: SemanticParams,
+) -> tuple[IntArray, ByteArray]:
+    """Instances (m,) and their classes after low extensions joined the buildings they stand against.
+
+    From the air the wall above an annex is hardly seen: its roof hangs metres below that of the house, and only in plan
+    do the two touch.
+    """
+    n = len(object_class)
+    groups = Groups(label, n)
+    cell_m = params.building_gap_m / 2
+    area = count_cells(xyz[:, :2], label, n, cell_m) * cell_m**2
+    is_small = np.isin(object_class, (ObjectClass.MOBILE, ObjectClass.OTHER, ObjectClass.BUILDING))
+    is_small &= area < params.roof_least_m2
+    is_small &= np.nan_to_num(groups.quantile(height, 0.5)) > rules.roof_height_m
+    house = np.flatnonzero((object_class == ObjectClass.BUILDING)[label] & (label >= 0) & ~is_small[label])
+    annex = np.flatnonzero((label >= 0) & is_small[label])
+    if len(house) == 0 or len(annex) == 0:
+        return label, object_class
+    plan = np.column_stack([xyz[:, :2], np.zeros(len(xyz))])
+    found, _ = nearest(plan[house], plan[annex], params.annex_gap_m)
+    is_beside = found >= 0
+    pair = label[annex[is_beside]].astype(np.int64) * n + label[house[found[is_beside]]]
+    code, contact = np.unique(pair, return_counts=True)
+    own, host = np.divmod(code, n)
+    order = np.lexsort((host, -contact, own))
+    order = order[np.diff(own[order], prepend=-1) != 0]
+    order = order[contact[order] >= _LEAST_CONTACTS]
+    goal = np.arange(n, dtype=np.int32)
+    goal[own[order]] = host[order]
+    kept = np.flatnonzero(goal == np.arange(n))
+    number = np.full(n + 1, -1, dtype=np.int32)
+    number[kept] = np.arange(len(kept), dtype=np.int32)
+    return number[np.append(goal, n)[label]], object_class[kept]
+
+
+_LEAST_CONTACTS = 3
+"""Points of an annex that must lie beside its house."""
+
+
+def split_at_steps(xyz: FloatArray, label: IntArray, cell_m: float, step_m: float, least_cells: float) -> IntArray:
+    """Buildings (m,) cut where their roofs step: a row of houses is one building only where one roof covers it.
+
+    Parameters
+    ----------
+    xyz : (m, 3) float64, m
+        Points of buildings.
+    label : (m,) int32
+        What touches, 0 to n - 1.
+    cell_m : float
+        Edge of the columns whose highest points are compared with those of the eight columns around.
+    step_m : float
+        Neighbouring columns that differ by less are one roof.
+    least_cells : float
+        Roofs of fewer columns join the neighbour with which they share the longest border, however high it stands:
+        dormers, chimneys, annexes, and walls beside a roof.
+    """
+    if len(xyz) == 0:
+        return label
+    rows = np.column_stack([label.astype(np.int64), np.floor(xyz[:, :2] / cell_m).astype(np.int64)])
+    lattice = Lattice.around(rows)
+    key, column = np.unique(lattice.keys(rows), return_inverse=True)
+    column = column.ravel()
+    cell = np.zeros((len(key), 3), dtype=np.int64)
+    cell[column] = rows
+    top = np.full(len(key), -np.inf)
+    np.maximum.at(top, column, xyz[:, 2])
+    beside = []
+    for step in ((0, 1, 0), (0, 0, 1), (0, 1, 1), (0, 1, -1)):
+        found = lattice.find(key, cell + np.array(step))
+        here = np.flatnonzero(found >= 0)
+        beside.append(np.column_stack([here, found[here]]))
+    border = np.concatenate(beside)
+    is_level = np.abs(top[border[:, 0]] - top[border[:, 1]]) < step_m
+    roof = components(border[is_level], len(key))
+    while True:
+        n = int(roof.max()) + 1
+        size = np.bincount(roof, minlength=n)
+        pair = roof[border]
+        pair = pair[pair[:, 0] != pair[:, 1]].astype(np.int64)
+        code, length = np.unique(np.concatenate([pair, pair[:, ::-1]]) @ np.array([n, 1]), return_counts=True)
+        own, other = np.divmod(code, n)
+        best = np.lexsort((other, -length, own))
+        best = best[np.diff(own[best], prepend=-1) != 0]
+        best = best[size[own[best]] < least_cells]
+        if len(best) == 0:
+            return consecutive(roof[column])[0]
+        roof = components(np.column_stack([own[best], other[best]]), n)[roof]
 
 
 def _held_by_buildings(

@@ -7,11 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from loda_pdal.kernels.clusters import components
 from loda_pdal.model.boxes import upright_boxes
-from loda_pdal.model.cloud import BoolArray, Int64Array, IntArray
+from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array, IntArray
 from loda_pdal.model.grid import Lattice, cells_of
 from loda_pdal.model.groups import Groups, unique_rows
 from loda_pdal.model.pair import Pair
@@ -89,6 +90,23 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangePar
     return Parts(surfaces.map(taken), np.concatenate([nobody, parent]))
 
 
+def largest_regions(cells: Cells, n: int, params: ChangeParams) -> Pair[FloatArray]:
+    """Volume (n,) m3 of the largest solid region that each object lost (before) and gained (after); 0 where buildings
+    are not filled, and surfaces have no inside."""
+    if not params.fills_buildings:
+        return Pair(np.zeros(n), np.zeros(n))
+    everyone = np.ones(n, np.bool_)
+    sides = Pair((cells.owner.before, cells.is_lost), (cells.owner.after, cells.is_gained))
+
+    def largest(side: tuple[IntArray, BoolArray]) -> FloatArray:
+        volume = np.zeros(n)
+        for region in _regions(cells, *side, everyone, params):
+            volume[region.parent] = max(volume[region.parent], region.n_voxels * params.voxel_m**3)
+        return volume
+
+    return sides.map(largest)
+
+
 def dissolve(owner: Pair[IntArray], is_dissolved: BoolArray, n: int) -> tuple[Pair[IntArray], IntArray]:
     """Give the after side of matched pairs that are no pair an object number of its own.
 
@@ -124,8 +142,17 @@ def _regions(
     for index in np.flatnonzero(groups.counts >= params.part_min_voxels).tolist():
         inside = members[groups.members(index)]
         plan = unique_rows(cells.voxels.cell[inside, :2])
-        found.append(_Region(int(owner[inside[0]]), plan, len(inside)))
+        if params.part_min_width_m == 0 or width_of(plan) * params.voxel_m >= params.part_min_width_m:
+            found.append(_Region(int(owner[inside[0]]), plan, len(inside)))
     return found
+
+
+def width_of(columns: Int64Array) -> float:
+    """Width of the columns (k, 2) in cells where they are widest, whichever way they lie; 1 for a line of cells."""
+    low = columns.min(axis=0)
+    plan = np.zeros(tuple(columns.max(axis=0) - low + 3), np.bool_)
+    plan[tuple((columns - low + 1).T)] = True
+    return float(2.0 * ndimage.distance_transform_edt(plan).max() - 1.0)
 
 
 def _under(region: Int64Array, columns: Int64Array, *, fills_hull: bool) -> BoolArray:
