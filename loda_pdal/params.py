@@ -477,7 +477,7 @@ class ChangeParams(StageParams):
         is_length=True,
     )
     body_query_radius_m: float = param(
-        0.75,
+        0.55,
         "largest distance of a filled building's voxel to the nearest surface point",
         unit="m",
         low=0.05,

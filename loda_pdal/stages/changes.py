@@ -300,7 +300,7 @@ def _verdict(
 
 
 def _part_alone(cue: Cue, verdict: Verdict, params: ChangeParams) -> Verdict:
-    """A part of a building that one survey alone shows is growth or loss of the building, unless it is as large as one."""
+    """A part of a building that one survey alone shows is its growth or loss, unless it is as large as a building."""
     volume = max(cue.volume_before, cue.volume_after)
     if params.part_is_new_m3 == 0 or volume >= params.part_is_new_m3:
         return verdict

@@ -55,8 +55,8 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangePar
     voxels becomes a part, with all that stands in the columns under its outline. And where a new house was built
     against a shed, the two are one new object: the region that the other epoch shows too becomes a part.
 
-    Objects shorter than ``part_of_length_m`` that both epochs have stay whole, and so does an object of which a
-    region takes most columns.
+    Objects shorter than ``part_of_length_m`` that both epochs have stay whole, unless they are bodies beside other
+    bodies: where one house of a row ends is not certain. So does an object of which a region takes most columns.
     """
     owner = surfaces.map(lambda surface: surface.owner)
     nobody = np.full(n, -1, dtype=np.int32)
@@ -66,7 +66,11 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangePar
     is_pair = is_present.before & is_present.after
     xyz = np.concatenate([surface.xyz for surface in surfaces])
     size = upright_boxes(xyz, np.concatenate(list(owner)), n).size
-    is_long = is_pair & (np.fmax(size[:, 0], size[:, 1]) > params.part_of_length_m)
+    is_whole = np.fmax(size[:, 0], size[:, 1]) <= params.part_of_length_m
+    columns_of = _columns_of(cells, n)
+    if params.fills_buildings:
+        is_whole &= ~_are_in_rows(columns_of[0], n)
+    is_long = is_pair & ~is_whole
     own = cells.owner
     regions = [
         *_regions(cells, own.before, cells.is_lost, is_long, params),
@@ -74,7 +78,7 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangePar
         *_regions(cells, own.before, cells.is_near.after, ~is_pair, params),
         *_regions(cells, own.after, cells.is_near.before, ~is_pair, params),
     ]
-    columns, part, parent = _claim(regions, _columns_of(cells, n), fills_hull=not params.fills_buildings)
+    columns, part, parent = _claim(regions, columns_of, fills_hull=not params.fills_buildings)
     if len(parent) == 0:
         return Parts(owner, nobody)
     lattice = Lattice.around(columns)
@@ -124,6 +128,27 @@ def _columns_of(cells: Cells, n: int) -> tuple[Int64Array, Int64Array]:
     owned = [np.column_stack([side, cells.voxels.cell[:, :2]])[side >= 0] for side in cells.owner]
     rows = unique_rows(np.concatenate(owned).astype(np.int64))
     return rows, np.searchsorted(rows[:, 0], np.arange(n + 1))
+
+
+def _are_in_rows(columns: Int64Array, n: int) -> BoolArray:
+    """Whether each object (n,) has columns beside those of another; ``columns`` (k, 3) are (object, ix, iy)."""
+    plan = columns[:, 1:]
+    lattice = Lattice.around(plan)
+    keys, place = np.unique(lattice.keys(plan), return_inverse=True)
+    owner = columns[:, 0]
+    low, high = np.full(len(keys), n), np.full(len(keys), -1)
+    np.minimum.at(low, place.ravel(), owner)
+    np.maximum.at(high, place.ravel(), owner)
+    contacts = np.zeros(n, dtype=np.int64)
+    for step in np.ndindex(3, 3):
+        found = lattice.find(keys, plan + (np.array(step) - 1))
+        is_foreign = (found >= 0) & ((low[found] != owner) | (high[found] != owner))
+        contacts += np.bincount(owner[is_foreign], minlength=n)
+    return np.asarray(contacts >= _ROW_CONTACTS)
+
+
+_ROW_CONTACTS = 8
+"""Contacts between columns that make two bodies neighbours: more than a corner."""
 
 
 def _regions(
