@@ -4,9 +4,55 @@ from __future__ import annotations
 
 import json
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+
+if TYPE_CHECKING:
+    from loda_pdal.params import Parameters
+
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def _suite_options(command: F) -> F:
+    """Which blocks, and with which parameters: what `run` and `ablate` share."""
+    for option in reversed(
+        (
+            click.option("--suite", type=click.Choice(["vehicle", "airborne"]), required=True, help="Which blocks."),
+            click.option(
+                "--split",
+                type=click.Choice(["train", "validation", "test"]),
+                default="validation",
+                show_default=True,
+                help="Which of them; choices are made on train and validation only.",
+            ),
+            click.option("--models", type=click.Path(path_type=Path, exists=True), help="Folder of city models."),
+            click.option("--limit", type=click.IntRange(1), metavar="N", help="Only the first blocks."),
+            click.option("--preset", help="Parameters; street for vehicle, aerial for airborne, if left out."),
+            click.option(
+                "--set", "settings", metavar="STAGE.KEY=VALUE", multiple=True, help="Set one parameter; repeatable."
+            ),
+        )
+    ):
+        command = option(command)
+    return command
+
+
+def _chosen(suite: str, preset: str | None, settings: tuple[str, ...]) -> Parameters:
+    """The parameters that the options of a suite choose."""
+    from loda_pdal.params import Parameters
+
+    chosen = Parameters.preset(preset or {"vehicle": "street", "airborne": "aerial"}[suite])
+    for setting in settings:
+        chosen = chosen.with_setting(setting)
+    return chosen
+
+
+def _say(text: str) -> None:
+    click.echo(text, err=True)
 
 
 @click.group()
@@ -101,6 +147,40 @@ def score(run_dir: Path, truth_json: Path, as_json: bool, markdown: Path | None)
 
 
 @bench.command()
+@click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
+@_suite_options
+@click.option("--result", default="result", show_default=True, metavar="NAME", help="Folder of the results of a block.")
+@click.option("--json", "as_json", is_flag=True, help="Write everything as JSON.")
+@click.option("--markdown", type=click.Path(path_type=Path, dir_okay=False), help="Write the tables to this file too.")
+def run(
+    folder: Path,
+    suite: str,
+    split: str,
+    models: Path | None,
+    limit: int | None,
+    preset: str | None,
+    settings: tuple[str, ...],
+    result: str,
+    as_json: bool,
+    markdown: Path | None,
+) -> None:
+    """Simulate the blocks of a suite into FOLDER, run the method on each and score them together.
+
+    What is in FOLDER already is used, unless its parameters, the method or the simulator have changed since.
+    """
+    from loda_pdal.benchmark.evaluate import run_suite
+
+    _compile_kernels()
+    found = run_suite(
+        folder, suite, split, _chosen(suite, preset, settings), models=models, limit=limit, result=result, say=_say
+    )
+    tables = found.to_markdown()
+    if markdown is not None:
+        markdown.write_text(tables + "\n", encoding="utf-8")
+    click.echo(json.dumps(found.to_dict()) if as_json else tables)
+
+
+@bench.command()
 @click.option("--first", type=click.IntRange(0), default=101, show_default=True, help="First seed.")
 @click.option(
     "--last", type=click.IntRange(0), default=130, show_default=True, help="Last seed; test seeds are skipped."
@@ -176,7 +256,7 @@ def profile(
         repeats=repeats,
         seed=seed,
         options=["--preset", preset, *(["--threads", str(threads)] if threads else [])],
-        say=lambda text: click.echo(text, err=True),
+        say=_say,
     )
     click.echo(json.dumps(found.to_dict(), indent=2) if as_json else found.to_markdown())
 

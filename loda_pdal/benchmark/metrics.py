@@ -225,8 +225,8 @@ class ClassScores:
 
     @property
     def macro_iou(self) -> float | None:
-        """Plain mean over the classes that some point truly has."""
-        return _mean(self.iou(c) for c in CLASSES)
+        """Plain mean over the paper's classes (all but other) that some point truly has."""
+        return _mean(self.iou(c) for c in CLASSES if c is not ObjectClass.OTHER)
 
     def _counts(self, object_class: ObjectClass) -> tuple[int, int, int]:
         i = CLASSES.index(object_class)

@@ -110,7 +110,7 @@ def nearest_points(annotated_xyz: FloatArray, result: Points) -> Points:
         _, nearest = cKDTree(result.xyz).query(annotated_xyz, distance_upper_bound=MAX_DISTANCE_M * (1 + 1e-9))
 
     def taken(values: npt.NDArray[Any], unknown: int) -> npt.NDArray[Any]:
-        return np.append(values, values.dtype.type(unknown))[nearest]
+        return np.asarray(np.append(values, values.dtype.type(unknown))[nearest])
 
     return Points(
         annotated_xyz,
@@ -165,7 +165,8 @@ def _annotated(path: Path, epoch: int, truth: Truth, result: Points) -> JudgedPo
 
 
 def _judged(points: Points, truth_id: Int64Array, truth_change: ByteArray) -> JudgedPoints:
-    return JudgedPoints(*(getattr(points, item.name) for item in fields(points)), truth_id, truth_change)
+    said = {item.name: getattr(points, item.name) for item in fields(points)}
+    return JudgedPoints(**said, truth_id=truth_id, truth_change=truth_change)
 
 
 def _truth_change(cloud: Any, truth_id: Int64Array, truth: Truth) -> ByteArray:
