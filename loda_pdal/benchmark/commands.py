@@ -152,6 +152,7 @@ def score(run_dir: Path, truth_json: Path, as_json: bool, markdown: Path | None)
 @click.option("--result", default="result", show_default=True, metavar="NAME", help="Folder of the results of a block.")
 @click.option("--json", "as_json", is_flag=True, help="Write everything as JSON.")
 @click.option("--markdown", type=click.Path(path_type=Path, dir_okay=False), help="Write the tables to this file too.")
+@click.option("--sheet", type=click.Path(path_type=Path), help="Pictures of the largest mistakes, a PNG or a folder.")
 def run(
     folder: Path,
     suite: str,
@@ -163,21 +164,65 @@ def run(
     result: str,
     as_json: bool,
     markdown: Path | None,
+    sheet: Path | None,
 ) -> None:
     """Simulate the blocks of a suite into FOLDER, run the method on each and score them together.
 
     What is in FOLDER already is used, unless its parameters, the method or the simulator have changed since.
     """
     from loda_pdal.benchmark.evaluate import run_suite
+    from loda_pdal.benchmark.sheet import PER_PAGE, MistakeTiles, write_sheets
 
     _compile_kernels()
+    tiles = MistakeTiles(PER_PAGE)
     found = run_suite(
-        folder, suite, split, _chosen(suite, preset, settings), models=models, limit=limit, result=result, say=_say
+        folder,
+        suite,
+        split,
+        _chosen(suite, preset, settings),
+        models=models,
+        limit=limit,
+        result=result,
+        say=_say,
+        look=None if sheet is None else tiles.add,
     )
+    if sheet is not None:
+        title = f"{suite}, {split} split: the largest of {tiles.n} mistakes"
+        _say(f"pictures: {', '.join(map(str, write_sheets(tiles.largest, title, sheet)))}")
     tables = found.to_markdown()
     if markdown is not None:
         markdown.write_text(tables + "\n", encoding="utf-8")
     click.echo(json.dumps(found.to_dict()) if as_json else tables)
+
+
+@bench.command()
+@click.argument("run_dir", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.argument("truth_json", type=click.Path(path_type=Path, exists=True, dir_okay=False), required=False)
+@click.option(
+    "-o", "--output", "out", type=click.Path(path_type=Path), required=True, help="A PNG, or a folder for the pages."
+)
+@click.option("--largest", type=click.IntRange(1), default=24, show_default=True, metavar="N", help="How many to show.")
+@click.option("--per-page", type=click.IntRange(1, 60), default=24, show_default=True, help="How many on one page.")
+def sheet(run_dir: Path, truth_json: Path | None, out: Path, largest: int, per_page: int) -> None:
+    """Pictures of the largest mistakes of the run in RUN_DIR against TRUTH_JSON; of its largest changes without one."""
+    from loda_pdal.benchmark.runs import read_points, read_run
+    from loda_pdal.benchmark.sheet import MistakeTiles, change_tiles, write_sheets
+
+    name = "/".join(run_dir.resolve().parts[-2:])
+    if truth_json is None:
+        tiles = change_tiles(run_dir, read_points(run_dir), largest)
+        title = f"{name}: the {len(tiles)} largest changes"
+    else:
+        from loda_pdal.benchmark.protocols import judge
+        from loda_pdal.benchmark.truth import Truth
+
+        truth = Truth.read(truth_json)
+        points = read_run(run_dir, truth, truth_json.parent)
+        found = MistakeTiles(largest)
+        found.add("", run_dir, points, truth, judge(points, truth))
+        tiles, title = found.largest, f"{name}: {len(found.largest)} of {found.n} mistakes"
+    for path in write_sheets(tiles, title, out, per_page):
+        click.echo(path)
 
 
 @bench.command()

@@ -42,7 +42,10 @@ N_RESAMPLES = 1000
 
 _PACKAGE = Path(__file__).resolve().parent.parent
 _SIMULATOR = ("benchmark/simulate", "benchmark/truth.py")
-_METHOD = ("assembly.py", "io", "kernels", "model", "params.py", "pipeline.py", "stages")
+_METHOD = (
+    *(f"io/{name}.py" for name in ("crs", "geopackage", "las", "las_points", "las_writer")),
+    *("assembly.py", "kernels", "model", "params.py", "pipeline.py", "stages"),
+)
 
 
 @dataclass(frozen=True)
