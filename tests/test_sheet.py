@@ -65,10 +65,10 @@ def test_mistakes_come_by_size_with_what_is_known_of_them() -> None:
     points, truth = scene()
     notes = {5: ObjectNote("Unchanged", "building", "no cue above its limit")}
     found = mistakes(points, truth, judge(points, truth), notes, "a block")
-    shed, alarm, bin_ = found
+    shed, bin_, alarm = found
     assert [label for _, label in shed.labels] == [ADDED, UNCHANGED]
     assert shed.lines[0] == "building, shed" and shed.lines[2].startswith("object 5, building, Unchanged: no cue")
-    assert shed.lines[1].startswith("a block instance 1, 10.0 x 4.") and shed.lines[1].endswith("m, 0 + 800 points")
+    assert shed.lines[1].startswith("a block instance 1, 10.") and shed.lines[1].endswith("m, 0 + 800 points")
     assert points.truth_id[shed.points].tolist() == [1] * 800
     assert alarm.lines[0] == "false alarm on bin" and alarm.size == bin_.size < shed.size
 

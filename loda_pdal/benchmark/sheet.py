@@ -449,13 +449,15 @@ def _composed(
     text_top = section_top + SECTION_PX[0] + 4
     height = text_top + 15 * _LINES + 4
     tile = image_module.new("RGB", (TILE_PX, height), _PAPER)
+    pen = draw_module.Draw(tile)
     for picture, x, y in (
         (differs, GAP_PX, plan_top),
         (said, 2 * GAP_PX + PLAN_PX[1], plan_top),
         (section, GAP_PX, section_top),
     ):
         tile.paste(image_module.fromarray(picture), (x, y))
-    pen = draw_module.Draw(tile)
+        rows, columns = picture.shape[:2]
+        pen.rectangle((x, y, x + columns - 1, y + rows - 1), outline=_LINE)
     pen.rectangle((0, 0, TILE_PX - 1, height - 1), outline=_LINE)
     x = GAP_PX
     for n, (words, label) in enumerate(subject.labels):
