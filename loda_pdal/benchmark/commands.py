@@ -196,6 +196,37 @@ def run(
 
 
 @bench.command()
+@click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
+@_suite_options
+@click.option("--json", "as_json", is_flag=True, help="Write everything as JSON.")
+@click.option("--markdown", type=click.Path(path_type=Path, dir_okay=False), help="Write the tables to this file too.")
+def ablate(
+    folder: Path,
+    suite: str,
+    split: str,
+    models: Path | None,
+    limit: int | None,
+    preset: str | None,
+    settings: tuple[str, ...],
+    as_json: bool,
+    markdown: Path | None,
+) -> None:
+    """What each part of the method is worth on a suite: the paper's ablation table, and the same for what is ours.
+
+    Blocks and outcomes are kept in FOLDER, so that an interrupted table goes on where it was.
+    """
+    from loda_pdal.benchmark import ablation
+
+    _compile_kernels()
+    chosen = _chosen(suite, preset, settings)
+    found = ablation.ablate(folder, suite, split, chosen, models=models, limit=limit, say=_say)
+    tables = found.to_markdown()
+    if markdown is not None:
+        markdown.write_text(tables + "\n", encoding="utf-8")
+    click.echo(json.dumps(found.to_dict()) if as_json else tables)
+
+
+@bench.command()
 @click.argument("run_dir", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.argument("truth_json", type=click.Path(path_type=Path, exists=True, dir_okay=False), required=False)
 @click.option(

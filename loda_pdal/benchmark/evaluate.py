@@ -42,7 +42,7 @@ N_RESAMPLES = 1000
 
 _PACKAGE = Path(__file__).resolve().parent.parent
 _SIMULATOR = ("benchmark/simulate", "benchmark/truth.py")
-_METHOD = (
+METHOD_SOURCES = (
     *(f"io/{name}.py" for name in ("crs", "geopackage", "las", "las_points", "las_writer")),
     *("assembly.py", "kernels", "model", "params.py", "pipeline.py", "stages"),
 )
@@ -145,7 +145,7 @@ def run_suite(
         blocks.append(BlockScore(name, report, seconds))
         took = "" if seconds is None else f" in {seconds:.0f} s"
         say(f"{name}: mIoU {_per_cent(report.scores().macro_iou)}, {report.false_alarms_per_ha:.1f} alarms/ha{took}")
-    return SuiteScore(suite, split, _described(parameters), blocks)
+    return SuiteScore(suite, split, described(parameters), blocks)
 
 
 def prepared_blocks(
@@ -183,7 +183,7 @@ def _ensure_block(folder: Path, block: SuiteBlock, say: Say) -> bool:
     """Simulate a block unless it is there; whether its city model has room for it."""
     stamp = {"seed": block.seed, "options": _plain_options(block), "simulator": sources_digest(*_SIMULATOR)}
     target = folder / block.name
-    known = _read_stamp(target / "block.json")
+    known = read_stamp(target / "block.json")
     if known is not None and {k: known.get(k) for k in stamp} == stamp:
         return bool(known["has_room"])
     say(f"{block.name}: simulating")
@@ -211,9 +211,9 @@ def _ensure_result(block_dir: Path, result: str, parameters: Parameters, name: s
     stamp = {
         "block": hashlib.sha256((block_dir / "block.json").read_bytes()).hexdigest(),
         "parameters": json.loads(json.dumps(parameters.to_dict())),
-        "method": sources_digest(*_METHOD),
+        "method": sources_digest(*METHOD_SOURCES),
     }
-    if _read_stamp(stamp_path) == stamp and (block_dir / result / "run.json").is_file():
+    if read_stamp(stamp_path) == stamp and (block_dir / result / "run.json").is_file():
         return None
     say(f"{name}: running")
     stamp_path.unlink(missing_ok=True)
@@ -254,7 +254,8 @@ def _plain_options(block: SuiteBlock) -> dict[str, Any]:
     return options
 
 
-def _read_stamp(path: Path) -> dict[str, Any] | None:
+def read_stamp(path: Path) -> dict[str, Any] | None:
+    """The JSON object in a file; None where there is none."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -262,7 +263,7 @@ def _read_stamp(path: Path) -> dict[str, Any] | None:
     return found if isinstance(found, dict) else None
 
 
-def _described(parameters: Parameters) -> str:
+def described(parameters: Parameters) -> str:
     """The preset, and what is not as it says."""
     base = Parameters.preset(parameters.name).to_dict()
     own = parameters.to_dict()

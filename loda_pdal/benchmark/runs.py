@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +16,8 @@ from loda_pdal.model.cloud import ByteArray, FloatArray, Int64Array
 from loda_pdal.model.dimensions import CHANGE, EPOCH, OBJECT
 from loda_pdal.model.errors import InputError
 from loda_pdal.model.labels import ChangeLabel, ObjectClass
+from loda_pdal.model.pair import Pair
+from loda_pdal.model.records import ChangeResult
 from loda_pdal.model.transform import transform_points
 
 MAX_DISTANCE_M = 0.3
@@ -92,7 +95,7 @@ def read_run(run_dir: Path, truth: Truth, truth_dir: Path) -> JudgedPoints:
         _annotated(truth_dir / f"{name}.laz", code, truth, points.at(points.epoch == code))
         for code, name in ((0, "before"), (1, "after"))
     ]
-    return JudgedPoints(*(np.concatenate([getattr(p, item.name) for p in parts]) for item in fields(JudgedPoints)))
+    return _together(parts)
 
 
 def read_points(run_dir: Path) -> Points:
@@ -146,7 +149,17 @@ def _read_cloud(run_dir: Path) -> Any:
     )
 
 
-def _annotated(path: Path, epoch: int, truth: Truth, result: Points) -> JudgedPoints:
+class Annotation(NamedTuple):
+    """What is known of the points of one annotated survey, in their order: ``xyz`` (n, 3) m where the survey has them,
+    and per point as in `JudgedPoints`."""
+
+    xyz: FloatArray
+    truth_id: Int64Array
+    truth_change: ByteArray
+
+
+def read_annotation(path: Path, truth: Truth) -> Annotation:
+    """The annotation of one survey."""
     import laspy
 
     if not path.is_file():
@@ -156,12 +169,41 @@ def _annotated(path: Path, epoch: int, truth: Truth, result: Points) -> JudgedPo
             "truth-missing",
         )
     cloud = laspy.read(path)
-    xyz = np.column_stack([cloud.x, cloud.y, cloud.z])
-    if epoch == 0:
-        xyz = transform_points(truth.T_after_before, xyz)
     truth_id = np.asarray(cloud["TruthId"]).astype(np.int64)
+    return Annotation(np.column_stack([cloud.x, cloud.y, cloud.z]), truth_id, _truth_change(cloud, truth_id, truth))
+
+
+def judged_result(result: ChangeResult, annotation: Pair[Annotation], T_after_before: FloatArray) -> JudgedPoints:
+    """What a run found, before it is written, with the annotation of its input: points of both in the same order.
+
+    ``T_after_before`` is the true move of before-points, (4, 4), in map coordinates.
+    """
+    sides = []
+    moves = (T_after_before, np.eye(4))
+    for code, (said, known, T) in enumerate(zip(result.points, annotation, moves, strict=True)):
+        sides.append(
+            JudgedPoints(
+                transform_points(T, known.xyz),
+                np.full(len(said), code, dtype=np.uint8),
+                said.change,
+                said.object.astype(np.int64),
+                said.classification,
+                known.truth_id,
+                known.truth_change,
+            )
+        )
+    return _together(sides)
+
+
+def _annotated(path: Path, epoch: int, truth: Truth, result: Points) -> JudgedPoints:
+    known = read_annotation(path, truth)
+    xyz = transform_points(truth.T_after_before, known.xyz) if epoch == 0 else known.xyz
     near = replace(nearest_points(xyz, result), epoch=np.full(len(xyz), epoch, dtype=np.uint8))
-    return _judged(near, truth_id, _truth_change(cloud, truth_id, truth))
+    return _judged(near, known.truth_id, known.truth_change)
+
+
+def _together(sides: Sequence[JudgedPoints]) -> JudgedPoints:
+    return JudgedPoints(*(np.concatenate([getattr(s, item.name) for s in sides]) for item in fields(JudgedPoints)))
 
 
 def _judged(points: Points, truth_id: Int64Array, truth_change: ByteArray) -> JudgedPoints:
