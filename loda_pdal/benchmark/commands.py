@@ -257,6 +257,31 @@ def sheet(run_dir: Path, truth_json: Path | None, out: Path, largest: int, per_p
 
 
 @bench.command()
+@click.argument("clouds", type=click.Path(path_type=Path, exists=True, dir_okay=False), nargs=-1, required=True)
+@click.option("--preset", default="aerial", show_default=True, help="Parameters of the method.")
+@click.option("--set", "settings", metavar="STAGE.KEY=VALUE", multiple=True, help="Set one parameter; repeatable.")
+@click.option("--leave-out", type=click.IntRange(0, 255), multiple=True, help="Class that is not compared; repeatable.")
+@click.option("--json", "as_json", is_flag=True, help="Write everything as JSON.")
+def classes(
+    clouds: tuple[Path, ...], preset: str, settings: tuple[str, ...], leave_out: tuple[int, ...], as_json: bool
+) -> None:
+    """Ground, building and vegetation against the ASPRS classes of real airborne CLOUDS, one by one.
+
+    Noise, water, bridges and artefacts are not compared (classes 7, 9, 17, 18, 26, 65 and 66), unless --leave-out says
+    otherwise.
+    """
+    from loda_pdal.benchmark.labelled import LEFT_OUT, compare_labels, labels_table
+
+    _compile_kernels()
+    chosen = _chosen("airborne", preset, settings)
+    found = []
+    for path in clouds:
+        _say(f"{path.name}: classifying")
+        found.append(compare_labels(path, chosen, leave_out or LEFT_OUT))
+    click.echo(json.dumps([cloud.to_dict() for cloud in found]) if as_json else labels_table(found))
+
+
+@bench.command()
 @click.option("--first", type=click.IntRange(0), default=101, show_default=True, help="First seed.")
 @click.option(
     "--last", type=click.IntRange(0), default=130, show_default=True, help="Last seed; test seeds are skipped."
