@@ -58,7 +58,7 @@ def test_conditions_vary_within_their_bounds(models: Path) -> None:
 
 def test_models_must_be_there(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no delft\.city\.json"):
-        next(pieces("airborne", "test", tmp_path))
+        pieces("airborne", "test", tmp_path)
     with pytest.raises(InputError, match="pieces of cities"):
         run_suite(tmp_path, "airborne", "train", Parameters())
 
@@ -137,6 +137,9 @@ def test_pieces_without_room_are_passed_over(tmp_path: Path, monkeypatch: pytest
         found = evaluate.prepared_blocks(tmp_path, "airborne", "train", models=tmp_path, say=lambda text: None)
         assert [name for name, _ in found] == ["piece_2"]
     assert tried == [1, 2]
+    monkeypatch.setitem(SIZES["airborne"], "train", (0, 2))
+    with pytest.raises(InputError, match="room for 1 of 2 pieces"):
+        list(evaluate.prepared_blocks(tmp_path, "airborne", "train", models=tmp_path, say=lambda text: None))
 
 
 def test_the_interval_of_equal_blocks_is_their_score(folder: Path, one_block: SuiteBlock) -> None:

@@ -14,7 +14,7 @@ import json
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import cache
 from itertools import islice
@@ -39,6 +39,9 @@ Say = Callable[[str], None]
 
 N_RESAMPLES = 1000
 """Draws of blocks that the interval of a score is taken from."""
+
+MOST_CANDIDATES = 40
+"""So many pieces of cities are tried for each that is wanted."""
 
 _PACKAGE = Path(__file__).resolve().parent.parent
 _SIMULATOR = ("benchmark/simulate", "benchmark/truth.py")
@@ -153,21 +156,29 @@ def prepared_blocks(
 ) -> Iterator[tuple[str, Path]]:
     """Name and folder of each block of a suite, simulated where it is not there yet."""
     n_streets, n_pieces = SIZES[suite][split]
-    n_streets = min(n_streets, limit or n_streets)
-    n_pieces = min(n_pieces, (limit or n_streets + n_pieces) - n_streets)
+    if limit is not None:
+        n_streets, n_pieces = min(n_streets, limit), min(n_pieces, max(limit - n_streets, 0))
     if n_pieces and models is None:
         raise InputError(
             f"The {split} split of suite {suite} has pieces of cities.",
             "Name the folder of city models with --models.",
             "models-missing",
         )
-    fit = (b for b in pieces(suite, split, models or Path()) if _ensure_block(folder, b, say)) if n_pieces else iter(())
-    candidates: Iterable[SuiteBlock] = streets(suite, split)[:n_streets]
-    for block in candidates:
+    candidates = pieces(suite, split, models) if n_pieces and models is not None else iter(())
+    for block in streets(suite, split)[:n_streets]:
         _ensure_block(folder, block, say)
         yield block.name, folder / block.name
-    for block in islice(fit, n_pieces):
-        yield block.name, folder / block.name
+    found = 0
+    for block in islice(candidates, n_pieces * MOST_CANDIDATES):
+        if _ensure_block(folder, block, say):
+            found += 1
+            yield block.name, folder / block.name
+        if found == n_pieces:
+            break
+    if found < n_pieces:
+        raise InputError(
+            f"{models} has room for {found} of {n_pieces} pieces.", "Give other city models.", "city-model"
+        )
 
 
 def interval(reports: list[ScoreReport], *, by_part: bool = False) -> tuple[float, float]:

@@ -82,11 +82,12 @@ def pieces(suite: str, split: str, models: Path) -> Iterator[SuiteBlock]:
         raise InputError(
             f"{models} has no {missing[0]}.", "Give the folder of city models with --models.", "models-missing"
         )
-    for seed in count(FIRST_PIECE):
-        for model in names:
-            name = piece_name(model, suite, seed)
-            if split_of_piece(model, suite, seed) == split:
-                yield _block(name.replace(" ", "_"), split, seed, suite, str(models / model))
+    return (
+        _block(piece_name(model, suite, seed).replace(" ", "_"), split, seed, suite, str(models / model))
+        for seed in count(FIRST_PIECE)
+        for model in names
+        if split_of_piece(model, suite, seed) == split
+    )
 
 
 def piece_name(model: str, suite: str, seed: int) -> str:
