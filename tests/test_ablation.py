@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from loda_pdal import pipeline
 from loda_pdal.benchmark import ablation, evaluate
 from loda_pdal.benchmark.ablation import FULL, OURS, PAPER, Ablation, Outcome, Row, Variant, ablate
 from loda_pdal.benchmark.commands import bench
+from loda_pdal.benchmark.reuse import Runs
 from loda_pdal.benchmark.runs import JudgedPoints, judged_result, read_annotation, read_run
 from loda_pdal.benchmark.simulate import SimulationOptions
 from loda_pdal.benchmark.suites import SIZES, SuiteBlock
@@ -88,7 +91,7 @@ def test_rows_are_run_once(folder: Path, one_block: Path, monkeypatch: pytest.Mo
         "  preset street",
         "  preset street changes.use_lod=false ground_changes.lod_factor=0.0",
     ]
-    monkeypatch.setattr(ablation, "detect_changes", lambda *arguments: pytest.fail("was known"))
+    monkeypatch.setattr(ablation.Runs, "detect", lambda *arguments: pytest.fail("was known"))
     assert ablate(folder, "vehicle", "train", Parameters(), variants=variants).to_dict() == found.to_dict()
 
 
@@ -98,6 +101,41 @@ def test_the_command_writes_one_table(one_block: Path, monkeypatch: pytest.Monke
     done = CliRunner().invoke(bench, arguments, catch_exceptions=False)
     assert done.exit_code == 0 and "| Reference | full method |" in done.stdout
     assert "# Ablation on suite vehicle, train split: 1 blocks, preset street\n" in done.stdout
+
+
+def test_steps_are_not_repeated_and_the_answer_is_that_of_a_whole_run(
+    one_block: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    surveys = read_epochs(one_block / "before.laz", one_block / "after.laz")
+    runs = Runs(surveys)
+    runs.detect(Parameters())
+    called: list[str] = []
+    steps = ("fuse_epochs", "register_epochs", "form_superpoints", "segment_instances", "label_objects")
+    for name in steps:
+        usual = getattr(pipeline, name)
+
+        def watched(*inputs: Any, usual: Any = usual, name: str = name) -> Any:
+            called.append(name)
+            return usual(*inputs)
+
+        monkeypatch.setattr(pipeline, name, watched)
+        runs._first[watched] = runs._first.pop(usual)  # type: ignore[index, union-attr]
+    for setting, repeated in (
+        ("changes.use_height=false", ["label_objects"]),
+        ("instances.splits_crowns=false", ["segment_instances", "label_objects"]),
+        ("semantics.has_roofs=false", ["segment_instances", "label_objects"]),
+        ("superpoints.method=components", ["form_superpoints", "segment_instances", "label_objects"]),
+        ("icp.loss=l2", ["register_epochs", "form_superpoints", "segment_instances", "label_objects"]),
+        ("changes.use_lod=true", []),
+    ):
+        called.clear()
+        parameters = Parameters().with_setting(setting)
+        found = runs.detect(parameters)
+        assert called == repeated, setting
+        alone = detect_changes(*surveys, parameters)
+        assert [str(o) for o in found.objects] == [str(o) for o in alone.objects]
+        for one, other in zip(found.points, alone.points, strict=True):
+            np.testing.assert_array_equal(one.change, other.change)
 
 
 def test_a_result_is_judged_alike_before_and_after_it_is_written(one_block: Path, tmp_path: Path) -> None:

@@ -27,15 +27,14 @@ from loda_pdal.benchmark.evaluate import (
 )
 from loda_pdal.benchmark.metrics import LABELS, Scores, markdown_table
 from loda_pdal.benchmark.protocols import ScoreReport, judge
+from loda_pdal.benchmark.reuse import Runs
 from loda_pdal.benchmark.runs import Annotation, judged_result, read_annotation
 from loda_pdal.benchmark.truth import Truth
 from loda_pdal.io.las import read_epochs
 from loda_pdal.model.cloud import Int64Array
 from loda_pdal.model.errors import LodaError
 from loda_pdal.model.pair import Pair
-from loda_pdal.model.survey import Survey
 from loda_pdal.params import Parameters
-from loda_pdal.pipeline import detect_changes
 
 Change = Callable[[Parameters], Parameters]
 
@@ -319,15 +318,15 @@ def _outcomes(block_dir: Path, chosen: list[Parameters], say: Say) -> Iterable[O
     known = read_stamp(path) or {}
     if known.get("version") != version:
         known = {"version": version, "outcomes": {}}
-    loaded: tuple[Pair[Survey], Pair[Annotation], Truth] | None = None
+    loaded: tuple[Runs, Pair[Annotation], Truth] | None = None
     for parameters in chosen:
         key = hashlib.sha256(json.dumps(parameters.to_dict(), sort_keys=True).encode()).hexdigest()
         if key not in known["outcomes"]:
             if loaded is None:
                 loaded = _loaded(block_dir)
-            surveys, annotation, truth = loaded
+            runs, annotation, truth = loaded
             try:
-                result = detect_changes(surveys.before, surveys.after, parameters)
+                result = runs.detect(parameters)
             except LodaError as error:
                 raise type(error)(
                     f"{block_dir.name}, {described(parameters)}: {error.message}", error.remedy, error.code
@@ -341,10 +340,10 @@ def _outcomes(block_dir: Path, chosen: list[Parameters], say: Say) -> Iterable[O
         yield Outcome.from_dict(known["outcomes"][key])
 
 
-def _loaded(block_dir: Path) -> tuple[Pair[Survey], Pair[Annotation], Truth]:
+def _loaded(block_dir: Path) -> tuple[Runs, Pair[Annotation], Truth]:
     truth = Truth.read(block_dir / "truth.json")
     paths = Pair(block_dir / "before.laz", block_dir / "after.laz")
-    return read_epochs(*paths), paths.map(lambda path: read_annotation(path, truth)), truth
+    return Runs(read_epochs(*paths)), paths.map(lambda path: read_annotation(path, truth)), truth
 
 
 def _miou(confusion: Int64Array) -> float:
