@@ -13,9 +13,17 @@ from click.testing import CliRunner
 
 from loda_pdal.benchmark.blocks import block_of, fill_share, is_kept, split_of_block, split_of_name
 from loda_pdal.benchmark.commands import bench
-from loda_pdal.benchmark.metrics import LABELS, Scores, confusion_table, markdown_table
+from loda_pdal.benchmark.metrics import (
+    CLASSES,
+    LABELS,
+    ClassScores,
+    Scores,
+    class_table,
+    confusion_table,
+    markdown_table,
+)
 from loda_pdal.benchmark.protocols import combined, judge, judge_instances, majority, score_run
-from loda_pdal.benchmark.runs import NO_LABEL, JudgedPoints, Points, nearest_labels, read_run
+from loda_pdal.benchmark.runs import NO_LABEL, JudgedPoints, Points, nearest_points, read_run
 from loda_pdal.benchmark.simulate import SimulatedBlock, SimulationOptions, simulate_block, write_block
 from loda_pdal.benchmark.truth import Truth, TruthInstance
 from loda_pdal.model.errors import InputError
@@ -53,9 +61,10 @@ def truth_of(*instances: TruthInstance) -> Truth:
 def points_of(*rows: tuple[int, int, int, int, int]) -> JudgedPoints:
     """One point per row: truth id, truth change, epoch, predicted change, predicted object; 10 m apart."""
     table = np.array(rows, dtype=np.int64).reshape(-1, 5)
-    xy = np.column_stack([10.0 * np.arange(len(table)) + 0.5, np.full(len(table), 0.5)])
+    xyz = np.column_stack([10.0 * np.arange(len(table)) + 0.5, np.full((len(table), 2), 0.5)])
     as_byte = table.astype(np.uint8)
-    return JudgedPoints(xy, table[:, 0], as_byte[:, 1], as_byte[:, 2], as_byte[:, 3], table[:, 4])
+    classes = np.full(len(table), ObjectClass.BUILDING, dtype=np.uint8)
+    return JudgedPoints(xyz, as_byte[:, 2], as_byte[:, 3], table[:, 4], classes, table[:, 0], as_byte[:, 1])
 
 
 def repeated(n: int, row: tuple[int, int, int, int, int]) -> list[tuple[int, int, int, int, int]]:
@@ -205,13 +214,40 @@ def test_blocks_are_pooled_before_scoring() -> None:
 
 
 def test_nearest_label_reaches_thirty_centimetres() -> None:
-    result = Points(np.array([[0.0, 0, 0], [5.0, 0, 0]]), np.array([2, 3], dtype=np.uint8), np.array([7, 8]))
+    at = np.array([[0.0, 0, 0], [5.0, 0, 0]])
+    codes = np.array([2, 3], dtype=np.uint8)
+    result = Points(at, np.zeros(2, dtype=np.uint8), codes, np.array([7, 8]), codes)
     asked = np.array([[0.3, 0, 0], [0.31, 0, 0], [5.0, 0.2, 0.2]])
-    change, objects = nearest_labels(asked, result)
-    assert change.tolist() == [2, NO_LABEL, 3]
-    assert objects.tolist() == [7, 0, 8]
-    nothing = Points(np.empty((0, 3)), np.empty(0, dtype=np.uint8), np.empty(0, dtype=np.int64))
-    assert nearest_labels(asked, nothing)[0].tolist() == [NO_LABEL] * 3
+    near = nearest_points(asked, result)
+    assert near.change.tolist() == [2, NO_LABEL, 3]
+    assert near.object.tolist() == [7, 0, 8]
+    assert near.classification.tolist() == [2, ObjectClass.UNCLASSIFIED, 3]
+    nothing = nearest_points(asked, result.at(np.zeros(2, dtype=bool)))
+    assert nothing.change.tolist() == [NO_LABEL] * 3
+
+
+def test_class_scores_by_hand() -> None:
+    ground, building, vegetation, mobile = 2, 6, 5, 64
+    truth = [ground] * 4 + [building] * 3 + [vegetation] * 2 + [mobile] + [7]
+    predicted = [ground, ground, ground, building, building, building, 1, 3, vegetation, 65, ground]
+    scores = ClassScores(class_table(truth, predicted))
+    assert scores.table.sum() == 10  # noise is no class that is judged
+    assert scores.table[1].tolist() == [0, 2, 0, 0, 0, 1]
+    iou = {c: scores.iou(c) for c in CLASSES}
+    assert iou[ObjectClass.GROUND] == pytest.approx(3 / 4)
+    assert iou[ObjectClass.BUILDING] == pytest.approx(2 / 4)
+    assert iou[ObjectClass.VEGETATION] == 1.0  # low vegetation is vegetation
+    assert (iou[ObjectClass.MOBILE], iou[ObjectClass.OTHER]) == (0.0, None)
+    assert scores.macro_iou == pytest.approx((3 / 4 + 2 / 4 + 1 + 0) / 4)
+    assert scores.f1(ObjectClass.BUILDING) == pytest.approx(4 / 6)
+    assert "| building | 0.0 | 66.7 | 0.0 | 0.0 | 0.0 | 33.3 |" in scores.to_markdown()
+
+
+def test_points_of_no_instance_are_ground() -> None:
+    points = points_of((0, 1, 1, UNCHANGED, 0), (1, 1, 1, UNCHANGED, 1))
+    classes = judge(points, truth_of(instance(1, UNCHANGED))).classes
+    assert classes.iou(ObjectClass.GROUND) == 0.0 and classes.iou(ObjectClass.BUILDING) == 0.5
+    assert combined([judge(points, truth_of(instance(1, UNCHANGED)))] * 2).classes.table.sum() == 4
 
 
 # --- whole runs -----------------------------------------------------------------------------------------------------

@@ -41,9 +41,14 @@ def split_of_name(name: str) -> str:
     """
     if name in SEEN:
         return "train"
-    digest = hashlib.sha256(name.encode("utf-8")).digest()
-    share = int.from_bytes(digest[:8], "big") / 2.0**64
+    share = hash_share(name)
     return next(split for split, end in SPLITS if share < end or end == 1.0)
+
+
+def hash_share(name: str) -> float:
+    """Where the hash of a name lies between 0 and 1: the same on any machine, for ever."""
+    digest = hashlib.sha256(name.encode("utf-8")).digest()
+    return int.from_bytes(digest[:8], "big") / 2.0**64
 
 
 def fill_share(xy: FloatArray) -> float:

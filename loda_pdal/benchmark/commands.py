@@ -4,9 +4,55 @@ from __future__ import annotations
 
 import json
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+
+if TYPE_CHECKING:
+    from loda_pdal.params import Parameters
+
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def _suite_options(command: F) -> F:
+    """Which blocks, and with which parameters: what `run` and `ablate` share."""
+    for option in reversed(
+        (
+            click.option("--suite", type=click.Choice(["vehicle", "airborne"]), required=True, help="Which blocks."),
+            click.option(
+                "--split",
+                type=click.Choice(["train", "validation", "test"]),
+                default="validation",
+                show_default=True,
+                help="Which of them; choices are made on train and validation only.",
+            ),
+            click.option("--models", type=click.Path(path_type=Path, exists=True), help="Folder of city models."),
+            click.option("--limit", type=click.IntRange(1), metavar="N", help="Only the first blocks."),
+            click.option("--preset", help="Parameters; street for vehicle, aerial for airborne, if left out."),
+            click.option(
+                "--set", "settings", metavar="STAGE.KEY=VALUE", multiple=True, help="Set one parameter; repeatable."
+            ),
+        )
+    ):
+        command = option(command)
+    return command
+
+
+def _chosen(suite: str, preset: str | None, settings: tuple[str, ...]) -> Parameters:
+    """The parameters that the options of a suite choose."""
+    from loda_pdal.params import Parameters
+
+    chosen = Parameters.preset(preset or {"vehicle": "street", "airborne": "aerial"}[suite])
+    for setting in settings:
+        chosen = chosen.with_setting(setting)
+    return chosen
+
+
+def _say(text: str) -> None:
+    click.echo(text, err=True)
 
 
 @click.group()
@@ -101,6 +147,141 @@ def score(run_dir: Path, truth_json: Path, as_json: bool, markdown: Path | None)
 
 
 @bench.command()
+@click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
+@_suite_options
+@click.option("--result", default="result", show_default=True, metavar="NAME", help="Folder of the results of a block.")
+@click.option("--json", "as_json", is_flag=True, help="Write everything as JSON.")
+@click.option("--markdown", type=click.Path(path_type=Path, dir_okay=False), help="Write the tables to this file too.")
+@click.option("--sheet", type=click.Path(path_type=Path), help="Pictures of the largest mistakes, a PNG or a folder.")
+def run(
+    folder: Path,
+    suite: str,
+    split: str,
+    models: Path | None,
+    limit: int | None,
+    preset: str | None,
+    settings: tuple[str, ...],
+    result: str,
+    as_json: bool,
+    markdown: Path | None,
+    sheet: Path | None,
+) -> None:
+    """Simulate the blocks of a suite into FOLDER, run the method on each and score them together.
+
+    What is in FOLDER already is used, unless its parameters, the method or the simulator have changed since.
+    """
+    from loda_pdal.benchmark.evaluate import run_suite
+    from loda_pdal.benchmark.sheet import PER_PAGE, MistakeTiles, write_sheets
+
+    _compile_kernels()
+    tiles = MistakeTiles(PER_PAGE)
+    found = run_suite(
+        folder,
+        suite,
+        split,
+        _chosen(suite, preset, settings),
+        models=models,
+        limit=limit,
+        result=result,
+        say=_say,
+        look=None if sheet is None else tiles.add,
+    )
+    if sheet is not None:
+        title = f"{suite}, {split} split: the largest of {tiles.n} mistakes"
+        _say(f"pictures: {', '.join(map(str, write_sheets(tiles.largest, title, sheet)))}")
+    tables = found.to_markdown()
+    if markdown is not None:
+        markdown.write_text(tables + "\n", encoding="utf-8")
+    click.echo(json.dumps(found.to_dict()) if as_json else tables)
+
+
+@bench.command()
+@click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
+@_suite_options
+@click.option("--json", "as_json", is_flag=True, help="Write everything as JSON.")
+@click.option("--markdown", type=click.Path(path_type=Path, dir_okay=False), help="Write the tables to this file too.")
+def ablate(
+    folder: Path,
+    suite: str,
+    split: str,
+    models: Path | None,
+    limit: int | None,
+    preset: str | None,
+    settings: tuple[str, ...],
+    as_json: bool,
+    markdown: Path | None,
+) -> None:
+    """What each part of the method is worth on a suite: the paper's ablation table, and the same for what is ours.
+
+    Blocks and outcomes are kept in FOLDER, so that an interrupted table goes on where it was.
+    """
+    from loda_pdal.benchmark import ablation
+
+    _compile_kernels()
+    chosen = _chosen(suite, preset, settings)
+    found = ablation.ablate(folder, suite, split, chosen, models=models, limit=limit, say=_say)
+    tables = found.to_markdown()
+    if markdown is not None:
+        markdown.write_text(tables + "\n", encoding="utf-8")
+    click.echo(json.dumps(found.to_dict()) if as_json else tables)
+
+
+@bench.command()
+@click.argument("run_dir", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.argument("truth_json", type=click.Path(path_type=Path, exists=True, dir_okay=False), required=False)
+@click.option(
+    "-o", "--output", "out", type=click.Path(path_type=Path), required=True, help="A PNG, or a folder for the pages."
+)
+@click.option("--largest", type=click.IntRange(1), default=24, show_default=True, metavar="N", help="How many to show.")
+@click.option("--per-page", type=click.IntRange(1, 60), default=24, show_default=True, help="How many on one page.")
+def sheet(run_dir: Path, truth_json: Path | None, out: Path, largest: int, per_page: int) -> None:
+    """Pictures of the largest mistakes of the run in RUN_DIR against TRUTH_JSON; of its largest changes without one."""
+    from loda_pdal.benchmark.runs import read_points, read_run
+    from loda_pdal.benchmark.sheet import MistakeTiles, change_tiles, write_sheets
+
+    name = "/".join(run_dir.resolve().parts[-2:])
+    if truth_json is None:
+        tiles = change_tiles(run_dir, read_points(run_dir), largest)
+        title = f"{name}: the {len(tiles)} largest changes"
+    else:
+        from loda_pdal.benchmark.protocols import judge
+        from loda_pdal.benchmark.truth import Truth
+
+        truth = Truth.read(truth_json)
+        points = read_run(run_dir, truth, truth_json.parent)
+        found = MistakeTiles(largest)
+        found.add("", run_dir, points, truth, judge(points, truth))
+        tiles, title = found.largest, f"{name}: {len(found.largest)} of {found.n} mistakes"
+    for path in write_sheets(tiles, title, out, per_page):
+        click.echo(path)
+
+
+@bench.command()
+@click.argument("clouds", type=click.Path(path_type=Path, exists=True, dir_okay=False), nargs=-1, required=True)
+@click.option("--preset", default="aerial", show_default=True, help="Parameters of the method.")
+@click.option("--set", "settings", metavar="STAGE.KEY=VALUE", multiple=True, help="Set one parameter; repeatable.")
+@click.option("--leave-out", type=click.IntRange(0, 255), multiple=True, help="Class that is not compared; repeatable.")
+@click.option("--json", "as_json", is_flag=True, help="Write everything as JSON.")
+def classes(
+    clouds: tuple[Path, ...], preset: str, settings: tuple[str, ...], leave_out: tuple[int, ...], as_json: bool
+) -> None:
+    """Ground, building and vegetation against the ASPRS classes of real airborne CLOUDS, one by one.
+
+    Noise, water, bridges and artefacts are not compared (classes 7, 9, 17, 18, 26, 65 and 66), unless --leave-out says
+    otherwise.
+    """
+    from loda_pdal.benchmark.labelled import LEFT_OUT, compare_labels, labels_table
+
+    _compile_kernels()
+    chosen = _chosen("airborne", preset, settings)
+    found = []
+    for path in clouds:
+        _say(f"{path.name}: classifying")
+        found.append(compare_labels(path, chosen, leave_out or LEFT_OUT))
+    click.echo(json.dumps([cloud.to_dict() for cloud in found]) if as_json else labels_table(found))
+
+
+@bench.command()
 @click.option("--first", type=click.IntRange(0), default=101, show_default=True, help="First seed.")
 @click.option(
     "--last", type=click.IntRange(0), default=130, show_default=True, help="Last seed; test seeds are skipped."
@@ -176,7 +357,7 @@ def profile(
         repeats=repeats,
         seed=seed,
         options=["--preset", preset, *(["--threads", str(threads)] if threads else [])],
-        say=lambda text: click.echo(text, err=True),
+        say=_say,
     )
     click.echo(json.dumps(found.to_dict(), indent=2) if as_json else found.to_markdown())
 

@@ -1,4 +1,5 @@
-"""Scores of labelled instances: confusion table, accuracy, IoU and F1 per label (paper, section 4.4)."""
+"""Scores of labelled instances: confusion table, accuracy, IoU and F1 per label (paper, section 4.4); and IoU of the
+classes of points."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from loda_pdal.model.cloud import Int64Array
-from loda_pdal.model.labels import ChangeLabel
+from loda_pdal.model.labels import ChangeLabel, ObjectClass
 
 LABELS = (
     ChangeLabel.ADDED,
@@ -167,6 +168,93 @@ class Scores:
             [[label.title, *row] for label, row in zip(LABELS, self.confusion.tolist(), strict=True)],
         )
         return f"{summary}\n\n{confusion}"
+
+
+CLASSES = (
+    ObjectClass.GROUND,
+    ObjectClass.BUILDING,
+    ObjectClass.VEGETATION,
+    ObjectClass.MOBILE,
+    ObjectClass.OTHER,
+)
+"""Rows and columns of the table of classes; a last column counts points of any other class."""
+
+
+def class_table(truth: npt.ArrayLike, predicted: npt.ArrayLike) -> Int64Array:
+    """How often points of each true class were given each predicted one.
+
+    Parameters
+    ----------
+    truth, predicted : (n,) int
+        `ObjectClass` codes, 0 to 255; points whose true class is none of `CLASSES` are not counted.
+
+    Returns
+    -------
+    (5, 6) int64
+        Rows are truth, columns prediction, in the order of `CLASSES`, then anything else.
+    """
+    n = len(CLASSES)
+    place = np.full(256, n)
+    place[list(CLASSES)] = np.arange(n)
+    place[[3, 4]] = place[ObjectClass.VEGETATION]  # ASPRS tells low and medium vegetation apart
+    rows, columns = place[np.asarray(truth, dtype=np.int64)], place[np.asarray(predicted, dtype=np.int64)]
+    return np.bincount(rows * (n + 1) + columns, minlength=(n + 1) ** 2).reshape(n + 1, n + 1)[:n]
+
+
+@dataclass(frozen=True)
+class ClassScores:
+    """Scores of the classes of points.
+
+    Attributes
+    ----------
+    table : (5, 6) int64
+        As `class_table` returns it.
+    """
+
+    table: Int64Array
+
+    def iou(self, object_class: ObjectClass) -> float | None:
+        """Intersection over union of one class; None where no point truly has it."""
+        tp, fp, fn = self._counts(object_class)
+        return _ratio(tp, tp + fp + fn) if tp + fn else None
+
+    def f1(self, object_class: ObjectClass) -> float | None:
+        """F1 of one class; None where no point truly has it."""
+        tp, fp, fn = self._counts(object_class)
+        return _ratio(2 * tp, 2 * tp + fp + fn) if tp + fn else None
+
+    @property
+    def macro_iou(self) -> float | None:
+        """Plain mean over the paper's classes (all but other) that some point truly has."""
+        return _mean(self.iou(c) for c in CLASSES if c is not ObjectClass.OTHER)
+
+    def _counts(self, object_class: ObjectClass) -> tuple[int, int, int]:
+        i = CLASSES.index(object_class)
+        tp = int(self.table[i, i])
+        return tp, int(self.table[:, i].sum()) - tp, int(self.table[i].sum()) - tp
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "macro_iou": self.macro_iou,
+            "classes": {c.title: {"iou": self.iou(c), "f1": self.f1(c)} for c in CLASSES},
+            "confusion": {
+                "rows_truth": [c.title for c in CLASSES],
+                "columns_predicted": [*(c.title for c in CLASSES), "none"],
+                "counts": self.table.tolist(),
+            },
+        }
+
+    def to_markdown(self) -> str:
+        """IoU of each class, and where the points of each class went, in per cent."""
+        header = ["points", "mean IoU", *(f"{c.title} IoU" for c in CLASSES)]
+        scores = [int(self.table.sum()), self.macro_iou, *(self.iou(c) for c in CLASSES)]
+        shares = [
+            [c.title, *(float(n) / max(int(row.sum()), 1) for n in row)]
+            for c, row in zip(CLASSES, self.table, strict=True)
+        ]
+        went = markdown_table(["truth \\ predicted, %", *(c.title for c in CLASSES), "none"], shares)
+        return f"{markdown_table(header, [scores])}\n\n{went}"
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:

@@ -5,6 +5,8 @@ paper   every annotated non-ground instance gets one predicted label or none: th
 part    the same, but an instance of which only a part changed (a storey, an annex) is judged by the points of that part
 strict  predicted changed objects that overlap no annotated changed instance are false alarms, per hectare; the
         paper's protocol cannot see them
+
+Beside them stands how well the classes of points were told.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from loda_pdal.benchmark.metrics import Scores, markdown_table
+from loda_pdal.benchmark.metrics import ClassScores, Scores, class_table, markdown_table
 from loda_pdal.benchmark.runs import JudgedPoints, read_run
 from loda_pdal.benchmark.truth import EVALUATED_CLASSES, Truth, TruthInstance
 from loda_pdal.model.cloud import BoolArray, Int64Array
@@ -63,6 +65,8 @@ class ScoreReport:
         Area of 1 m cells in which most points are unchanged ground that was predicted to have changed.
     area_m2 : float
         Area of the blocks.
+    classes : ClassScores
+        Classes of the points of both epochs, of every annotated instance and of the ground.
     """
 
     judgements: list[Judgement]
@@ -70,6 +74,7 @@ class ScoreReport:
     n_changed_objects: int
     false_ground_m2: float
     area_m2: float
+    classes: ClassScores
 
     def scores(self, *, by_part: bool = False, object_class: ObjectClass | None = None) -> Scores:
         """Scores of the paper's protocol, or by changed part; of all non-ground instances, or of one class."""
@@ -117,6 +122,7 @@ class ScoreReport:
                     for a in self.false_alarms
                 ],
             },
+            "classes": self.classes.to_dict(),
             "n_excluded": sum(j.instance.excluded is not None for j in self.judgements),
             "instances": [
                 {
@@ -167,6 +173,8 @@ class ScoreReport:
                         ]
                     ],
                 ),
+                "## Classes of points",
+                self.classes.to_markdown(),
             ]
         )
 
@@ -185,13 +193,21 @@ def combined(reports: Sequence[ScoreReport]) -> ScoreReport:
         sum(r.n_changed_objects for r in reports),
         sum(r.false_ground_m2 for r in reports),
         sum(r.area_m2 for r in reports),
+        ClassScores(sum((r.classes.table for r in reports), class_table([], []))),
     )
 
 
 def judge(points: JudgedPoints, truth: Truth) -> ScoreReport:
     """All protocols at once."""
     false_alarms, n_objects = _false_alarms(points, truth)
-    return ScoreReport(judge_instances(points, truth), false_alarms, n_objects, _false_ground_m2(points), truth.area_m2)
+    return ScoreReport(
+        judge_instances(points, truth),
+        false_alarms,
+        n_objects,
+        _false_ground_m2(points),
+        truth.area_m2,
+        judge_classes(points, truth),
+    )
 
 
 def judge_instances(points: JudgedPoints, truth: Truth) -> list[Judgement]:
@@ -209,6 +225,14 @@ def judge_instances(points: JudgedPoints, truth: Truth) -> list[Judgement]:
     is_in_part[is_counted] |= ~is_partly_changed[points.truth_id[is_counted]]
     whole, part = _votes(points, is_counted, n_ids), _votes(points, is_in_part, n_ids)
     return [Judgement(i, majority(whole[i.instance_id]), majority(part[i.instance_id])) for i in truth.instances]
+
+
+def judge_classes(points: JudgedPoints, truth: Truth) -> ClassScores:
+    """Predicted against true classes, point by point; what belongs to no instance is ground."""
+    classes = np.full(int(points.truth_id.max(initial=max(truth.by_id, default=0))) + 1, ObjectClass.GROUND)
+    for i in truth.instances:
+        classes[i.instance_id] = i.object_class
+    return ClassScores(class_table(classes[points.truth_id], points.classification))
 
 
 def majority(votes: Int64Array) -> ChangeLabel:
@@ -236,7 +260,7 @@ def _false_alarms(points: JudgedPoints, truth: Truth) -> tuple[list[FalseAlarm],
     is_of_object = (points.object > 0) & _is_change(points.change.astype(np.int64))
     ids, place = np.unique(points.object[is_of_object], return_inverse=True)
     change = points.change[is_of_object].astype(np.int64)
-    xy, truth_id = points.xy[is_of_object], points.truth_id[is_of_object]
+    xy, truth_id = points.xyz[is_of_object, :2], points.truth_id[is_of_object]
     changed = [i.instance_id for i in truth.instances if i.is_changed and i.excluded is None]
     excluded = [i.instance_id for i in truth.instances if i.excluded is not None]
     n_points = np.bincount(place, minlength=len(ids))
@@ -262,7 +286,7 @@ def _false_ground_m2(points: JudgedPoints) -> float:
     is_ground = (points.truth_id == 0) & (points.object == 0)
     if not is_ground.any():
         return 0.0
-    cells, place = np.unique(np.floor(points.xy[is_ground]).astype(np.int64), axis=0, return_inverse=True)
+    cells, place = np.unique(np.floor(points.xyz[is_ground, :2]).astype(np.int64), axis=0, return_inverse=True)
     is_false = _is_change(points.change[is_ground].astype(np.int64))
     n, n_false = (
         np.bincount(place.ravel(), minlength=len(cells)),

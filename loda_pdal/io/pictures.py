@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from loda_pdal.io.colours import rgb
 from loda_pdal.kernels.splat import NOTHING, shade, splat
-from loda_pdal.model.cloud import ByteArray, FloatArray, Int64Array
+from loda_pdal.model.cloud import ByteArray, Float32Array, FloatArray, Int64Array
 
 IndexArray = npt.NDArray[np.intp]
 
@@ -75,11 +75,20 @@ def draw_points(
     ramp : int
         0 for the grey ramp of the palette, 1 for the coloured one.
     """
-    nearest, colour = np.full(view.shape, NOTHING), np.zeros(view.shape, dtype=np.float32)
+    nearest, colour = depth_buffer(view, points, tone, point_m)
+    shade(nearest, colour, 1 + ramp * RAMP, RAMP, picture)
+
+
+def depth_buffer(
+    view: View, points: tuple[FloatArray, FloatArray, FloatArray], value: FloatArray, point_m: float
+) -> tuple[Float32Array, Float32Array]:
+    """Depth of the nearest point in each pixel (`NOTHING` where none is) and its ``value`` (n,), both (rows, columns)
+    float32; the rest as for `draw_points`."""
+    nearest, found = np.full(view.shape, NOTHING), np.zeros(view.shape, dtype=np.float32)
     dot = _dot(min(24, max(1, math.ceil(point_m / view.pixel_m))))
     corner = float(view.u0), float(view.v0)
-    splat(*map(np.ascontiguousarray, (*points, tone)), *corner, float(view.pixel_m), dot, nearest, colour)
-    shade(nearest, colour, 1 + ramp * RAMP, RAMP, picture)
+    splat(*map(np.ascontiguousarray, (*points, value)), *corner, float(view.pixel_m), dot, nearest, found)
+    return nearest, found
 
 
 def _dot(size: int) -> Int64Array:

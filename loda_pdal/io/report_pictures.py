@@ -103,7 +103,7 @@ def _pictures(scene: Scene, members: Pair[IndexArray], label: ChangeLabel, footp
     if not len(points):
         return ""
     colours = palette(LABEL_COLOURS[label])
-    plan, axis = _plan_view(points, footprint), _main_axis(points[:, :2])
+    plan, axis = _plan_view(points, footprint), main_axis(points[:, :2])
     profile, slab = _profile_view(points, axis)
     sideways = np.array([-axis[1], axis[0]])
     ends = np.array([profile.u0, profile.u0 + profile.width_m])
@@ -144,7 +144,7 @@ def _plan_view(points: FloatArray, footprint: Any) -> View:
     return View(float(centre[0] - width / 2), float(centre[1] - height / 2), float(width), height, width / PICTURE_PX)
 
 
-def _main_axis(xy: FloatArray) -> FloatArray:
+def main_axis(xy: FloatArray) -> FloatArray:
     """Unit direction (2,) in which points (n, 2) stretch most, pointing east (north where it runs due north)."""
     centred = xy - xy.mean(axis=0)
     values, vectors = np.linalg.eigh(centred.T @ centred + np.diag([1e-9, 0.0]))
