@@ -458,6 +458,14 @@ class ChangeParams(StageParams):
         high=10,
         is_length=True,
     )
+    plant_width_m: float = param(
+        0.0,
+        "a piece of vegetation this wide on what the other survey saw bare is a plant of its own; 0: never",
+        unit="m",
+        low=0,
+        high=100,
+        is_length=True,
+    )
     part_is_new_m3: float = param(
         80.0,
         "a part of a building that only one survey has, and as large as this, is a building that was Added or Removed",
@@ -753,6 +761,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "vegetation_height_m": 0.8,
             "fills_buildings": True,
             "part_min_width_m": 1.5,
+            "plant_width_m": 2.5,
         },
         "observability": {"cell_m": 2.0},
     },

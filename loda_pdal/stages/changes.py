@@ -111,7 +111,7 @@ def decide_changes(
         cast = cast.without_pairs(is_no_pair).settled(voxels)
         cells = cells_with_owners(voxels, cast.surfaces, len(cast), params)
     if params.find_parts:
-        cast = cast.with_parts(split_parts(cells, cast.surfaces, len(cast), params)).settled(voxels)
+        cast = cast.with_parts(split_parts(cells, cast.surfaces, cast.object_class, params)).settled(voxels)
         cells = cells_with_owners(voxels, cast.surfaces, len(cast), params)
     evidence = weigh(cells, cast.surfaces, len(cast), params)
     regions = largest_regions(cells, len(cast), params)
@@ -284,8 +284,8 @@ def _verdict(
 ) -> Verdict:
     """Label of one object; ``is_apart``: it was matched, but the pair turned out to be two objects."""
     if not (cue.is_before and cue.is_after):
-        verdict = _unmatched(cue, is_apart, params, observability)
-        return _part_alone(cue, verdict, params) if is_part and cue.object_class == ObjectClass.BUILDING else verdict
+        alone = _unmatched(cue, is_apart, params, observability)
+        return _part_alone(cue, alone, params) if is_part and cue.object_class == ObjectClass.BUILDING else alone
     if observability.is_enabled and cue.observability < observability.min_observability:
         return Verdict(
             ChangeLabel.UNDETERMINED,

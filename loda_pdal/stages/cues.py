@@ -168,6 +168,19 @@ class Cells:
         return (self.owner.before >= 0) & ~self.is_near.after & self.is_seen.after
 
     @property
+    def bare_columns(self) -> Pair[BoolArray]:
+        """Voxels in whose whole column that epoch saw, and has no surface in reach of any occupied voxel."""
+        first = self.voxels.columns[:-1]
+        size = np.diff(self.voxels.columns)
+
+        def is_bare(near: BoolArray, seen: BoolArray) -> BoolArray:
+            if len(near) == 0:
+                return near
+            return np.repeat(~np.logical_or.reduceat(near, first), size) & seen
+
+        return self.is_near.join(self.is_seen, is_bare)
+
+    @property
     def is_common(self) -> BoolArray:
         """Both epochs have a surface here."""
         return self.is_near.before & self.is_near.after
@@ -228,23 +241,20 @@ class Evidence:
 
     def at(self, index: Int64Array) -> Evidence:
         """The cues of the objects ``index`` (k,)."""
-        return self._of_each(lambda values: values[index])
+        return self._each(lambda values: values[index])
 
     def together(self, other: Evidence) -> Evidence:
         """The cues of these objects, then of those of ``other``."""
-        pairs = {item.name: (getattr(self, item.name), getattr(other, item.name)) for item in fields(self)}
-        return Evidence(
-            **{
-                name: own.join(more, _concatenated) if isinstance(own, Pair) else _concatenated(own, more)
-                for name, (own, more) in pairs.items()
-            }
-        )
+        return self._each(lambda own, more: np.concatenate([own, more]), other)
 
-    def _of_each(self, change: Callable[[FloatArray], FloatArray]) -> Evidence:
-        values = {item.name: getattr(self, item.name) for item in fields(self)}
-        return Evidence(
-            **{name: side.map(change) if isinstance(side, Pair) else change(side) for name, side in values.items()}
-        )
+    def _each(self, change: Callable[..., FloatArray], *others: Evidence) -> Evidence:
+        """Every cue changed, that of ``others`` beside it."""
+        values: dict[str, Any] = {}
+        for item in fields(self):
+            own, *more = (getattr(side, item.name) for side in (self, *others))
+            is_pair = isinstance(own, Pair)
+            values[item.name] = Pair(*map(change, own, *more)) if is_pair else change(own, *more)
+        return Evidence(**values)
 
 
 def sample_voxels(
@@ -277,10 +287,6 @@ def sample_voxels(
         displacement=displacement,
         lod95=lod.at(centre),
     )
-
-
-def _concatenated(first: FloatArray, second: FloatArray) -> FloatArray:
-    return np.concatenate([first, second])
 
 
 def cells_with_owners(voxels: Voxels, surfaces: Pair[Surface], n: int, params: ChangeParams) -> Cells:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,9 +12,10 @@ from scipy.spatial import cKDTree
 
 from loda_pdal.kernels.clusters import components
 from loda_pdal.model.boxes import upright_boxes
-from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array, IntArray
+from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, Int64Array, IntArray
 from loda_pdal.model.grid import Lattice, cells_of
 from loda_pdal.model.groups import Groups, unique_rows
+from loda_pdal.model.labels import ObjectClass
 from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams
 from loda_pdal.stages.cues import Cells, Surface
@@ -48,7 +49,7 @@ class _Region(NamedTuple):
     n_voxels: int
 
 
-def split_parts(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -> Parts:
+def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, params: ChangeParams) -> Parts:
     """Take what changed out of long objects, and what did not out of objects that only one epoch has.
 
     A terrace is one object, but one of its houses may have a new storey: a connected region of gained, or of lost,
@@ -57,7 +58,11 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangePar
 
     Objects shorter than ``part_of_length_m`` that both epochs have stay whole, unless they are bodies beside other
     bodies: where one house of a row ends is not certain. So does an object of which a region takes most columns.
+
+    Plants grow together: where a piece of a plant, ``plant_width_m`` wide, stands on what the other survey saw bare, it
+    is a plant of its own, and not a growth of its neighbour.
     """
+    n = len(object_class)
     owner = surfaces.map(lambda surface: surface.owner)
     nobody = np.full(n, -1, dtype=np.int32)
     if n == 0 or len(cells.voxels) == 0:
@@ -72,13 +77,20 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangePar
         is_whole &= ~_are_in_rows(columns_of[0], n)
     is_long = is_pair & ~is_whole
     own = cells.owner
+    is_plant = is_pair & (object_class == ObjectClass.VEGETATION) & (params.plant_width_m > 0)
+    bare = cells.bare_columns
+    whole_plant = replace(params, part_min_width_m=params.plant_width_m, part_min_voxels=1)
+    is_long &= ~is_plant
     regions = [
+        *_regions(cells, own.before, bare.after, is_plant, whole_plant),
+        *_regions(cells, own.after, bare.before, is_plant, whole_plant),
         *_regions(cells, own.before, cells.is_lost, is_long, params),
         *_regions(cells, own.after, cells.is_gained, is_long, params),
         *_regions(cells, own.before, cells.is_near.after, ~is_pair, params),
         *_regions(cells, own.after, cells.is_near.before, ~is_pair, params),
     ]
-    columns, part, parent = _claim(regions, columns_of, fills_hull=not params.fills_buildings)
+    most_of = np.where(is_plant, 1.0, _MOST_OF)
+    columns, part, parent = _claim(regions, columns_of, most_of, fills_hull=not params.fills_buildings)
     if len(parent) == 0:
         return Parts(owner, nobody)
     lattice = Lattice.around(columns)
@@ -190,7 +202,7 @@ def _under(region: Int64Array, columns: Int64Array, *, fills_hull: bool) -> Bool
 
 
 def _claim(
-    regions: list[_Region], columns_of: tuple[Int64Array, Int64Array], *, fills_hull: bool
+    regions: list[_Region], columns_of: tuple[Int64Array, Int64Array], most_of: FloatArray, *, fills_hull: bool
 ) -> tuple[Int64Array, Int64Array, IntArray]:
     """Columns (k, 3) that parts take, the part of each, and the parent of each part; the largest region comes first."""
     rows, start = columns_of
@@ -199,7 +211,7 @@ def _claim(
     for region in sorted(regions, key=lambda r: (-r.n_voxels, r.parent, r.columns[0].tolist())):
         first, last = start[region.parent], start[region.parent + 1]
         is_inside = _under(region.columns, rows[first:last, 1:], fills_hull=fills_hull)
-        if np.count_nonzero(is_inside) > _MOST_OF * (last - first):
+        if np.count_nonzero(is_inside) > most_of[region.parent] * (last - first):
             continue
         is_free = is_inside & (part_of[first:last] < 0)
         if is_free.any():
