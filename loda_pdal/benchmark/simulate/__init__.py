@@ -9,10 +9,18 @@ from __future__ import annotations
 from loda_pdal.benchmark.simulate.block import (
     SimulatedBlock,
     SimulatedSurvey,
-    SimulationOptions,
     fused_block,
     simulate_block,
 )
+from loda_pdal.benchmark.simulate.options import Reality, SimulationOptions
 from loda_pdal.benchmark.simulate.writer import write_block
 
-__all__ = ["SimulatedBlock", "SimulatedSurvey", "SimulationOptions", "fused_block", "simulate_block", "write_block"]
+__all__ = [
+    "Reality",
+    "SimulatedBlock",
+    "SimulatedSurvey",
+    "SimulationOptions",
+    "fused_block",
+    "simulate_block",
+    "write_block",
+]

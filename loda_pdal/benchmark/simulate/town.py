@@ -75,8 +75,13 @@ class ModelHouse:
         z[z > _WALL_TOP_M] += self.lift_m
         z[z < 0.3] -= FOUNDATION_M
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        is_roof = np.abs(normal[:, 2]) > 0.2 * np.linalg.norm(normal, axis=1)
-        parts = [of_triangles(corners[is_roof], Material.ROOF_TILE), of_triangles(corners[~is_roof], Material.BRICK)]
+        rise = np.abs(normal[:, 2]) / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
+        kinds = (
+            (rise <= 0.2, Material.FACADE),
+            ((rise > 0.2) & (rise <= 0.98), Material.ROOF_TILE),
+            (rise > 0.98, Material.BITUMEN),
+        )
+        parts = [of_triangles(corners[is_kind], material) for is_kind, material in kinds]
         parts += [box(low, high, Material.CONCRETE).placed(0, 0, 0, yaw) for low, high, yaw in self.boxes]
         return joined(parts)
 
