@@ -15,6 +15,7 @@ from loda_pdal.benchmark.simulate.block import SimulatedBlock
 from loda_pdal.benchmark.simulate.city_model import read_city_model
 from loda_pdal.benchmark.simulate.sensor import scan
 from loda_pdal.benchmark.simulate.shapes import Material, box, distance_to_triangles, quads
+from loda_pdal.benchmark.simulate.world import World
 from loda_pdal.model.errors import InputError
 from loda_pdal.model.labels import ChangeLabel
 from loda_pdal.model.transform import transform_points
@@ -98,7 +99,7 @@ def test_the_aircraft_leaves_the_density_that_was_asked_for() -> None:
     sensor = AirborneSensor(60.0, 50.0, density=8.0, noise_m=0.0, strip_shift_m=0.0, drift_m=0.0, drift_deg=0.0)
     random = np.random.default_rng(5)
     ground = quads(np.array([[(-80, -80, 0), (140, -80, 0), (140, 80, 0), (-80, 80, 0)]]), Material.GRASS)
-    found = scan(sensor, ground, fly(sensor, 0.0, random), random)
+    found = scan(sensor, World(ground), fly(sensor, 0.0, random), random)
     x, y, z = found.xyz.T
     is_inside = (x > 5) & (x < 55) & (np.abs(y) < 20)
     assert np.abs(z).max() < 1e-6

@@ -15,12 +15,12 @@ from loda_pdal.benchmark.simulate.evidence import Evidence, instances_of
 from loda_pdal.benchmark.simulate.options import SimulationOptions
 from loda_pdal.benchmark.simulate.plan import SurveyPlan, draw_plans
 from loda_pdal.benchmark.simulate.scene import Ground, draw_street
-from loda_pdal.benchmark.simulate.sensor import rigid_move, scan
+from loda_pdal.benchmark.simulate.sensor import Drive, rigid_move, scan
 from loda_pdal.benchmark.simulate.town import draw_town, draw_town_edits
 from loda_pdal.benchmark.simulate.traffic import CYCLE_Y_M, draw_traffic
 from loda_pdal.benchmark.simulate.world import World
 from loda_pdal.benchmark.truth import Truth
-from loda_pdal.model.cloud import ByteArray, FloatArray
+from loda_pdal.model.cloud import ByteArray, FloatArray, Int64Array
 from loda_pdal.model.frame import LocalFrame
 from loda_pdal.model.labels import ChangeLabel
 from loda_pdal.model.pair import Pair
@@ -232,7 +232,7 @@ def _misregistration(random: np.random.Generator, options: SimulationOptions, T_
 
 def _survey(one: Evidence, T_map_street: FloatArray, start_time: float) -> SimulatedSurvey:
     measured, path = one.measured, one.plan.path
-    station = np.unique(np.round(np.linspace(0, len(path.time) - 1, 400)).astype(int))
+    station = _stations(path)
     positions = transform_points(T_map_street, path.recorded[station])
     xyz = transform_points(T_map_street, measured.xyz)
     return SimulatedSurvey(
@@ -245,6 +245,18 @@ def _survey(one: Evidence, T_map_street: FloatArray, start_time: float) -> Simul
         measured.n_returns,
         np.column_stack([start_time + path.time[station], positions]),
     )
+
+
+def _stations(path: Drive) -> Int64Array:
+    """Which columns of a drive its trajectory lists: the ends, and about `_STATIONS_PER_S` a second between them."""
+    number = np.floor((path.time - path.time[:1]) * _STATIONS_PER_S).astype(np.int64)
+    is_listed = np.diff(number, prepend=-1, append=number[-1:] + 1)[:-1] > 0
+    is_listed[-1:] = True
+    return np.flatnonzero(is_listed)
+
+
+_STATIONS_PER_S = 10.0
+"""Rows of a trajectory per second that was driven: half a metre on the road, six in the air."""
 
 
 def _outline(T_map_street: FloatArray, options: SimulationOptions) -> list[tuple[float, float]]:

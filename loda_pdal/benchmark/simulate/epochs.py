@@ -126,7 +126,7 @@ def changes_of_returns(scenes: Pair[EpochScene], scans: Pair[Scan], items: list[
         surface = scenes.map(lambda scene, owner=item.instance_id: _surface_of(scene, owner))  # type: ignore[misc]
         for scene, measured, change, other in zip(scenes, scans, changes, surface.swapped, strict=True):
             at = np.flatnonzero((scene.owner[measured.primitive] == item.instance_id) & (change != UNCHANGED))
-            change[at[distance_to_triangles(measured.xyz[at], other) < _SAME_SURFACE_M]] = UNCHANGED
+            change[at[distance_to_triangles(measured.met_xyz[at], other) < _SAME_SURFACE_M]] = UNCHANGED
     return changes
 
 
@@ -136,5 +136,5 @@ def _surface_of(scene: EpochScene, instance_id: int) -> FloatArray:
     return np.asarray(triangles[scene.owner[: len(triangles)] == instance_id])
 
 
-_SAME_SURFACE_M = 0.12
+_SAME_SURFACE_M = 0.05
 """Returns this near to the other survey's surface of the same building show nothing that changed."""

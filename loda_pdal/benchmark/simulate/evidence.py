@@ -131,7 +131,7 @@ def reason_to_exclude(instance: TruthInstance, seen: Pair[Seen], options: Simula
 
 
 class _Caught(NamedTuple):
-    """What one survey caught of an instance: its returns (n, 3) and those from changed surface, street's frame, m."""
+    """What one survey caught of an instance: its returns (n, 3), and where it met changed surface (k, 3), m."""
 
     points: FloatArray
     changed: FloatArray
@@ -143,8 +143,9 @@ def _caught(one: Evidence, n_ids: int) -> list[_Caught]:
     order = np.argsort(owner, kind="stable")
     bounds = np.searchsorted(owner[order], np.arange(1, n_ids))
     points = np.split(one.measured.xyz[order], bounds)
+    met = np.split(one.measured.met_xyz[order], bounds)
     is_changed = np.split(one.change[order] != ChangeLabel.UNCHANGED, bounds)
-    return [_Caught(p, p[c]) for p, c in zip(points, is_changed, strict=True)]
+    return [_Caught(p, m[c]) for p, m, c in zip(points, met, is_changed, strict=True)]
 
 
 def _places_seen(instance: TruthInstance, caught: Pair[_Caught], evidence: Pair[Evidence]) -> Pair[Seen]:

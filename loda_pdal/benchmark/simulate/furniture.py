@@ -55,7 +55,9 @@ class BusShelter:
         posts = [tube((a, y - 0.03, -0.2), (a, y - 0.03, h), 0.05, 0.05, Material.METAL, 6) for a in (-x, 0.0, x)]
         advert = box((x - 0.08, -y, 0.15), (x + 0.08, y, h - 0.2), Material.SIGN, has_bottom=True)
         bench = box((-x + 0.5, y - 0.5, 0.42), (x - 0.9, y - 0.15, 0.48), Material.WOOD, has_bottom=True)
-        return joined([slab(roof, 0.1, Material.METAL), quads(np.array(panes), Material.GLASS), *posts, advert, bench])
+        return joined(
+            [slab(roof, 0.1, Material.METAL), quads(np.array(panes), Material.CLEAR_GLASS), *posts, advert, bench]
+        )
 
 
 @dataclass(frozen=True)

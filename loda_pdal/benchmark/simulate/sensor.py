@@ -113,6 +113,8 @@ class Scan(NamedTuple):
     ----------
     xyz : (n, 3) float64, m
         As reported, with range noise and pose error, in the street's frame.
+    met_xyz : (n, 3) float64, m
+        Where the pulse truly met the surface; what returns from behind a pane met the pane.
     primitive : (n,) int64
         Which primitive of the scene was hit.
     time : (n,) float64, s
@@ -124,6 +126,7 @@ class Scan(NamedTuple):
     """
 
     xyz: FloatArray
+    met_xyz: FloatArray
     primitive: Int64Array
     time: FloatArray
     intensity: npt.NDArray[np.uint16]
@@ -307,6 +310,7 @@ def _scan_columns(
         echoes.append(
             _Echoes(
                 pulse[hit[kept]],
+                at[kept],
                 (range_m + noise[hit])[kept],
                 hits.primitive[hit[kept]].astype(np.int64),
                 np.clip(60000.0 * signal * speckle[hit], 1, 65535)[kept].astype(np.uint16),
@@ -319,13 +323,14 @@ def _scan_columns(
     pose = column[found.pulse]
     measured = directions[found.pulse] * found.range_m[:, None]
     xyz = path.recorded[pose] + measured + np.cross(path.turn[pose], measured)
-    return Scan(xyz, found.primitive, path.time[pose], found.intensity, return_number, n_returns)
+    return Scan(xyz, found.met_xyz, found.primitive, path.time[pose], found.intensity, return_number, n_returns)
 
 
 class _Echoes(NamedTuple):
-    """Returns of pulses: which pulse, how far away (m), which primitive, how bright."""
+    """Returns of pulses: which pulse, where it met the surface, its range (m), which primitive, how bright."""
 
     pulse: Int64Array
+    met_xyz: FloatArray
     range_m: FloatArray
     primitive: Int64Array
     intensity: npt.NDArray[np.uint16]
@@ -333,9 +338,9 @@ class _Echoes(NamedTuple):
 
 def _in_order(echoes: list[_Echoes]) -> _Echoes:
     """All returns in the order of their pulses, near ones first."""
-    pulse, range_m, primitive, intensity = (np.concatenate(part) for part in zip(*echoes, strict=True))
-    order = np.argsort(pulse, kind="stable")
-    return _Echoes(pulse[order], range_m[order], primitive[order], intensity[order])
+    joined: list[Any] = [np.concatenate(part) for part in zip(*echoes, strict=True)]
+    order = np.argsort(joined[0], kind="stable")
+    return _Echoes(*(part[order] for part in joined))
 
 
 def _depth_behind(
