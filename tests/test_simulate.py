@@ -409,3 +409,6 @@ def test_simulate_command(tmp_path: Path) -> None:
     assert Truth.read(out / "truth.json").made_by["seed"] == 5
     result = CliRunner().invoke(bench, [*asked, "--overwrite", "--leaf", "0.25"])
     assert json.loads(result.output)["points"]["before"] < summary["points"]["before"]
+    result = CliRunner().invoke(bench, [*asked, "--overwrite", "--plain"])
+    assert Truth.read(out / "truth.json").made_by["options"]["reality"]["traffic"] == 0.0
+    assert result.exit_code == 0 and not any(i.edit == "passing by" for i in Truth.read(out / "truth.json").instances)

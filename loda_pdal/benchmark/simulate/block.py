@@ -248,11 +248,11 @@ def _survey(one: Evidence, T_map_street: FloatArray, start_time: float) -> Simul
 
 
 def _stations(path: Drive) -> Int64Array:
-    """Which columns of a drive its trajectory lists: the ends, and about `_STATIONS_PER_S` a second between them."""
+    """Which columns of a drive its trajectory lists: both ends of each pass, and `_STATIONS_PER_S` a second between."""
     number = np.floor((path.time - path.time[:1]) * _STATIONS_PER_S).astype(np.int64)
-    is_listed = np.diff(number, prepend=-1, append=number[-1:] + 1)[:-1] > 0
-    is_listed[-1:] = True
-    return np.flatnonzero(is_listed)
+    is_next = np.diff(number, prepend=-1) > 0
+    is_last = np.diff(path.time, append=np.inf) > 1.0
+    return np.flatnonzero(is_next | is_last)
 
 
 _STATIONS_PER_S = 10.0

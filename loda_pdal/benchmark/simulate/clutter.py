@@ -391,9 +391,9 @@ _FILLS: tuple[tuple[Callable[[_Site], None], int, int], ...] = (
 
 _EDITS: tuple[tuple[Callable[[_Site], None], int, int], ...] = (
     (_remove_from_row, 0, 1),
-    (_change_dormer, 0, 1),
+    (_change_dormer, 0, 2),
     (_other_vehicle, 1, 2),
-    (_halve_hedge, 0, 1),
-    (_other_boundary, 0, 1),
+    (_halve_hedge, 0, 2),
+    (_other_boundary, 0, 2),
 )
 """Each kind of edit of what stands there with the fewest and the most of it per 100 m of street."""

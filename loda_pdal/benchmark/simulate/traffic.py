@@ -17,6 +17,12 @@ from loda_pdal.benchmark.simulate.world import Mover
 CYCLE_Y_M = 2.65
 """Where cyclists ride, m from the middle of the street: between the lanes and the parked vehicles."""
 
+_LANE_Y_M = 1.6
+"""Where oncoming cars drive at least."""
+
+_LEAST_GAP_M = 1.8
+"""Nobody whose middle would come nearer to the scanner sets out."""
+
 _COMPANION_SHARE = 0.5
 """Passes of the scanner with a car ahead of or behind it."""
 
@@ -71,11 +77,12 @@ def _of_pass(
         gap = float(random.uniform(7.5, 16.0) * random.choice([-1.0, 1.0]))
         slip = float(random.uniform(0.0, 0.12) * speed * np.sign(gap))  # the gap only grows
         movers.append(mover(draw_car(random), float(x[0]) + forward * gap, lane, forward * (speed + slip)))
-    if abs(lane) > 1.0:
+    if abs(lane) > 0.5:
         # all at one speed and well apart, so that none drives through another
+        other_lane = -np.sign(lane) * max(abs(lane), _LANE_Y_M)
         pace, at = float(random.uniform(4.0, 8.0)), float(x[0]) + forward * random.uniform(12.0, 40.0)
         for _ in range(int(random.poisson(_ONCOMING * amount * (stop - start)))):
-            movers.append(mover(draw_car(random), float(at), -lane, -forward * pace))
+            movers.append(mover(draw_car(random), float(at), float(other_lane), -forward * pace))
             at += forward * random.uniform(11.0, 60.0)
     low, high = float(x.min()), float(x.max())
     for rate, y, paces in ((_CYCLISTS, CYCLE_Y_M, (3.0, 5.5)), (_WALKERS, walk_y_m, (0.7, 1.7))):
@@ -84,4 +91,6 @@ def _of_pass(
             side, way = random.choice([-1.0, 1.0], 2)
             beside = float(side * (y + random.uniform(-0.08, 0.08)))
             movers.append(mover(thing, float(random.uniform(low, high)), beside, float(way * random.uniform(*paces))))
-    return movers
+    places = path.position[one_pass, :2]
+    gaps = [np.linalg.norm(m.position(time)[:, :2] - places, axis=1).min() for m in movers]
+    return [m for m, gap in zip(movers, gaps, strict=True) if gap > _LEAST_GAP_M]
