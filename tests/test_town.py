@@ -15,6 +15,7 @@ from loda_pdal.benchmark.simulate.block import SimulatedBlock
 from loda_pdal.benchmark.simulate.city_model import read_city_model
 from loda_pdal.benchmark.simulate.sensor import scan
 from loda_pdal.benchmark.simulate.shapes import Material, box, distance_to_triangles, quads
+from loda_pdal.benchmark.simulate.town import ModelHouse, party_walls
 from loda_pdal.benchmark.simulate.world import World
 from loda_pdal.model.errors import InputError
 from loda_pdal.model.labels import ChangeLabel
@@ -83,6 +84,20 @@ def test_a_house_is_read_with_its_size(tmp_path: Path) -> None:
         edges = np.diff(house.triangles, axis=1)
         area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum() / 2
         assert area == pytest.approx(2 * 50 + 2 * (40 + 12) + 2 * 10 * 5, rel=1e-9)  # walls, gables, roof; no floor
+
+
+def test_a_house_whose_model_lacks_a_wall_gets_one(tmp_path: Path) -> None:
+    document = _city([(100.0, 200.0)])
+    del document["CityObjects"]["house 0"]["geometry"][0]["boundaries"][0][3]  # the gable wall at the right
+    path = tmp_path / "a.city.json"
+    path.write_text(json.dumps(document), encoding="utf-8")
+    (house,) = read_city_model(path)
+    walls = party_walls(ModelHouse(house.name, house.triangles - (0.0, 0.0, house.foot_m), house.footprint))
+    np.testing.assert_allclose(walls[:, :, 0], 110.0, atol=1e-6)
+    assert walls[:, :, 2].max() == pytest.approx(8.0, abs=0.5)
+    edges = np.diff(walls, axis=1)
+    area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum() / 2
+    assert area == pytest.approx(40 + 12, rel=0.1)
 
 
 def test_what_is_no_city_model_is_named(tmp_path: Path) -> None:
