@@ -86,7 +86,9 @@ class World:
         limit = np.minimum(range_m, max_range_m)
         for first, (mover, caster) in zip(self._first, self._movers, strict=True):
             centre, radius = mover.sphere
-            at = np.flatnonzero((time >= mover.start_s) & (time <= mover.stop_s))
+            is_there = (time >= mover.start_s) & (time <= mover.stop_s)
+            along = np.abs(mover.x + mover.speed_m_s * (time - mover.start_s) - origins[:, 0])
+            at = np.flatnonzero(is_there & (along < limit + radius))
             offset = mover.position(time[at]) - origins[at]
             ahead = np.sum((offset + centre) * directions[at], axis=1)
             aside = np.sum((offset + centre) ** 2, axis=1) - ahead**2
