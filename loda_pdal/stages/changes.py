@@ -294,7 +294,7 @@ def _verdict(
         )
     if cue.object_class == ObjectClass.MOBILE:
         return _mobile(cue, params)
-    if is_part and cue.object_class == ObjectClass.BUILDING and (verdict := _new_part(cue, params)):
+    if is_part and (verdict := _new_part(cue, params)):
         return verdict
     return _pair(cue, params)
 
@@ -312,9 +312,11 @@ def _part_alone(cue: Cue, verdict: Verdict, params: ChangeParams) -> Verdict:
 
 
 def _new_part(cue: Cue, params: ChangeParams) -> Verdict | None:
-    """A part as large as a building where the other survey has next to nothing: one house of a row came or went."""
+    """A part of which the other survey has next to nothing: one house of a row, one of several plants, came or went."""
+    is_green = cue.object_class == ObjectClass.VEGETATION
     large = max(cue.volume_before, cue.volume_after)
-    if params.part_is_new_m3 == 0 or large < params.part_is_new_m3:
+    least_m3 = 0.0 if is_green and params.plant_width_m > 0 else params.part_is_new_m3
+    if large < least_m3 or not (is_green or cue.object_class == ObjectClass.BUILDING) or params.part_is_new_m3 == 0:
         return None
     for label, own, volume, other in (
         (ChangeLabel.ADDED, cue.gained, cue.volume_after, "before"),
@@ -322,9 +324,8 @@ def _new_part(cue: Cue, params: ChangeParams) -> Verdict | None:
     ):
         shown = volume - own * params.voxel_m**3
         if volume == large and shown <= _NEXT_TO_NOTHING * large:
-            return Verdict(
-                label, f"{large:.0f} m3 of building in a row, of which the {other} survey shows {shown:.0f} m3"
-            )
+            what = "a plant among others" if is_green else "building in a row"
+            return Verdict(label, f"{large:.0f} m3 of {what}, of which the {other} survey shows {shown:.0f} m3")
     return None
 
 
