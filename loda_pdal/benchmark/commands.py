@@ -8,6 +8,8 @@ from pathlib import Path
 
 import click
 
+_FOLDER = click.Path(path_type=Path, exists=True, file_okay=False)
+
 
 @click.group()
 def bench() -> None:
@@ -101,6 +103,44 @@ def score(run_dir: Path, truth_json: Path, as_json: bool, markdown: Path | None)
 
 
 @bench.command()
+@click.argument("folders", metavar="BLOCK_DIR...", nargs=-1, required=True, type=_FOLDER)
+@click.option("--train", "training", metavar="BLOCK_DIR", multiple=True, type=_FOLDER, help="Block to train on.")
+@click.option(
+    "--preset",
+    type=click.Choice(("street", "aerial")),
+    default="street",
+    show_default=True,
+    help="Parameters of our own method, and of the baselines tuned for such surveys.",
+)
+@click.option("--tune", "is_tuning", is_flag=True, help="Search the baselines' parameters on these blocks instead.")
+@click.option("--json", "as_json", is_flag=True, help="Write everything as JSON.")
+@click.option("--markdown", type=click.Path(path_type=Path, dir_okay=False), help="Write the table to this file too.")
+def baselines(
+    folders: tuple[Path, ...],
+    training: tuple[Path, ...],
+    preset: str,
+    is_tuning: bool,
+    as_json: bool,
+    markdown: Path | None,
+) -> None:
+    """Compare loda-pdal with M3C2, nDSM differencing, a random forest and C2C on the blocks in BLOCK_DIR...
+
+    All get the same registration and ground heights. The random forest is trained on the blocks given with --train.
+    """
+    from loda_pdal.benchmark.baselines import run_baselines, tune
+
+    _compile_kernels()
+    if is_tuning:
+        for name, found in tune(folders, training=training, preset=preset, say=_say).items():
+            click.echo(f"{name}: {found.params}, mIoU {100 * found.macro_iou:.1f}")
+        return
+    comparison = run_baselines(folders, training=training, preset=preset, say=_say)
+    if markdown is not None:
+        markdown.write_text(comparison.to_markdown() + "\n", encoding="utf-8")
+    click.echo(json.dumps(comparison.to_dict()) if as_json else comparison.to_markdown())
+
+
+@bench.command()
 @click.option("--first", type=click.IntRange(0), default=101, show_default=True, help="First seed.")
 @click.option(
     "--last", type=click.IntRange(0), default=130, show_default=True, help="Last seed; test seeds are skipped."
@@ -176,9 +216,13 @@ def profile(
         repeats=repeats,
         seed=seed,
         options=["--preset", preset, *(["--threads", str(threads)] if threads else [])],
-        say=lambda text: click.echo(text, err=True),
+        say=_say,
     )
     click.echo(json.dumps(found.to_dict(), indent=2) if as_json else found.to_markdown())
+
+
+def _say(text: str) -> None:
+    click.echo(text, err=True)
 
 
 def _compile_kernels() -> None:

@@ -85,7 +85,7 @@ def read_run(run_dir: Path, truth: Truth, truth_dir: Path) -> JudgedPoints:
     objects = np.asarray(cloud[OBJECT.name]).astype(np.int64)
     if "TruthId" in names:
         truth_id = np.asarray(cloud["TruthId"]).astype(np.int64)
-        truth_change = _truth_change(cloud, truth_id, truth)
+        truth_change = truth_change_of(cloud, truth_id, truth)
         return JudgedPoints(xyz[:, :2], truth_id, truth_change, epoch, change, objects)
     parts = []
     for code, name in ((0, "before"), (1, "after")):
@@ -136,10 +136,10 @@ def _annotated(path: Path, epoch: int, truth: Truth, result: Points) -> JudgedPo
     truth_id = np.asarray(cloud["TruthId"]).astype(np.int64)
     change, objects = nearest_labels(xyz, result)
     epochs = np.full(len(xyz), epoch, dtype=np.uint8)
-    return JudgedPoints(xyz[:, :2], truth_id, _truth_change(cloud, truth_id, truth), epochs, change, objects)
+    return JudgedPoints(xyz[:, :2], truth_id, truth_change_of(cloud, truth_id, truth), epochs, change, objects)
 
 
-def _truth_change(cloud: Any, truth_id: Int64Array, truth: Truth) -> ByteArray:
+def truth_change_of(cloud: Any, truth_id: Int64Array, truth: Truth) -> ByteArray:
     """Label of the surface of each point; that of its whole instance where the cloud does not say."""
     if "TruthChange" in set(cloud.point_format.dimension_names):
         return np.asarray(cloud["TruthChange"])
