@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import laspy
 import numpy as np
@@ -16,10 +15,10 @@ from loda_pdal.benchmark.baselines import baseline as baseline_module
 from loda_pdal.benchmark.baselines import c2c, compare, forest, m3c2, ndsm, run_baselines, tune
 from loda_pdal.benchmark.baselines.baseline import Baseline
 from loda_pdal.benchmark.baselines.columns import Columns, connected, label_of_regions, without_small
-from loda_pdal.benchmark.baselines.scene import Scene, judged_points, read_block, scene_of
+from loda_pdal.benchmark.baselines.scene import Block, Scene, judged_points, read_block, scene_of
 from loda_pdal.benchmark.baselines.tuned import TUNED
 from loda_pdal.benchmark.commands import bench
-from loda_pdal.benchmark.protocols import judge
+from loda_pdal.benchmark.protocols import ScoreReport, judge
 from loda_pdal.benchmark.truth import Truth, TruthInstance
 from loda_pdal.model.errors import InputError
 from loda_pdal.model.labels import ChangeLabel, ObjectClass
@@ -128,29 +127,30 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.fixture(scope="module")
-def scenes(folders: dict[str, Path]) -> dict[str, Scene]:
+def known(folders: dict[str, Path]) -> dict[str, tuple[Block, Scene]]:
     aerial = Parameters.preset("aerial")
-    return {name: scene_of(read_block(folder), aerial) for name, folder in folders.items()}
+    blocks = {name: read_block(folder) for name, folder in folders.items()}
+    return {name: (block, scene_of(block.surveys, aerial)) for name, block in blocks.items()}
 
 
-def method_of(name: str, scenes: dict[str, Scene]) -> Baseline:
+def method_of(name: str, known: dict[str, tuple[Block, Scene]]) -> Baseline:
     if name == "forest":
         pytest.importorskip("sklearn")
-        return forest.baseline([scenes["training"], scenes["quiet training"]])
+        return forest.baseline([known["training"], known["quiet training"]])
     if name == "m3c2":
         pytest.importorskip("py4dgeo")
     return {"ndsm": ndsm.BASELINE, "c2c": c2c.BASELINE, "m3c2": m3c2.BASELINE}[name]
 
 
-def report_of(method: Baseline, scene: Scene, params: Any = None) -> Any:
-    params = params or TUNED["aerial"][method.name]
+def report_of(method: Baseline, block: Block, scene: Scene) -> ScoreReport:
+    params = TUNED["aerial"][method.name]
     marks = method.decide(scene, method.measure(scene, params), params)
-    return judge(judged_points(scene.block, scene.on_points(marks)), scene.block.truth)
+    return judge(judged_points(block, scene.on_points(marks)), block.truth)
 
 
 @pytest.mark.parametrize("name", ["ndsm", "c2c", "m3c2", "forest"])
-def test_every_box_is_found_for_what_it_is(name: str, scenes: dict[str, Scene]) -> None:
-    report = report_of(method_of(name, scenes), scenes["changed"])
+def test_every_box_is_found_for_what_it_is(name: str, known: dict[str, tuple[Block, Scene]]) -> None:
+    report = report_of(method_of(name, known), *known["changed"])
     found = {j.instance.label: j.predicted for j in report.judgements}
     assert {label: found[label] for label in (ADDED, REMOVED, UNCHANGED)} == {x: x for x in (ADDED, REMOVED, UNCHANGED)}
     by_part = {j.instance.label: j.predicted_part for j in report.judgements}
@@ -159,14 +159,14 @@ def test_every_box_is_found_for_what_it_is(name: str, scenes: dict[str, Scene]) 
 
 
 @pytest.mark.parametrize("name", ["ndsm", "c2c", "m3c2", "forest"])
-def test_a_scene_that_did_not_change_stays_silent(name: str, scenes: dict[str, Scene]) -> None:
-    report = report_of(method_of(name, scenes), scenes["quiet"])
+def test_a_scene_that_did_not_change_stays_silent(name: str, known: dict[str, tuple[Block, Scene]]) -> None:
+    report = report_of(method_of(name, known), *known["quiet"])
     assert report.n_changed_objects == 0
     assert report.scores().accuracy == 1.0
 
 
-def test_tops_are_heights_of_the_boxes(scenes: dict[str, Scene]) -> None:
-    columns = Columns.of(scenes["changed"])
+def test_tops_are_heights_of_the_boxes(known: dict[str, tuple[Block, Scene]]) -> None:
+    columns = Columns.of(known["changed"][1])
     for heights, place in zip(HEIGHTS.values(), PLACES, strict=True):
         i, j = (int((c + BOX_M / 2) * 2) for c in place)
         for height, top in zip(heights, columns.top, strict=True):
@@ -194,13 +194,12 @@ def test_small_regions_are_dropped_and_the_rest_renumbered() -> None:
     assert connected(touching, 2).tolist() == [[1, 0, 0, 0], [0, 1, 0, 0]]
 
 
-def test_holes_take_the_mean_of_their_neighbours(scenes: dict[str, Scene]) -> None:
-    scene = scenes["changed"]
+def test_holes_take_the_mean_of_their_neighbours(known: dict[str, tuple[Block, Scene]]) -> None:
+    _, scene = known["changed"]
     clouds = scene.clouds.map(lambda cloud: cloud.moved(np.floor(cloud.xyz / 0.5) * 0.5 + 0.25))
     middle = np.floor(clouds.after.xyz[:, :2].mean(axis=0) / 0.5) * 0.5 + 0.25
     is_kept = np.any(np.abs(clouds.after.xyz[:, :2] - middle) > 0.1, axis=1)
     holed = Scene(
-        scene.block,
         Pair(clouds.before, clouds.after.subset(is_kept)),
         Pair(np.full(len(clouds.before), 1.0), np.full(is_kept.sum(), 3.0)),
     )

@@ -141,6 +141,35 @@ def baselines(
 
 
 @bench.command()
+@click.argument("folders", metavar="SCENE_DIR...", nargs=-1, required=True, type=_FOLDER)
+@click.option("--preset", type=click.Choice(("street", "aerial")), default="aerial", show_default=True)
+@click.option("--json", "as_json", is_flag=True, help="Write everything as JSON.")
+@click.option("--markdown", type=click.Path(path_type=Path, dir_okay=False), help="Write the table to this file too.")
+def urb3dcd(folders: tuple[Path, ...], preset: str, as_json: bool, markdown: Path | None) -> None:
+    """Point-wise scores on Urb3DCD scenes: folders with pointCloud0.ply and pointCloud1.ply."""
+    from loda_pdal.benchmark.urb3dcd import run_scenes, to_markdown
+
+    _compile_kernels()
+    scores = run_scenes(folders, preset=preset, say=_say)
+    table = to_markdown(scores)
+    if markdown is not None:
+        markdown.write_text(table + "\n", encoding="utf-8")
+    click.echo(json.dumps({name: found.to_dict() for name, found in scores.items()}) if as_json else table)
+
+
+@bench.command(name="urb3dcd-export")
+@click.argument("block", metavar="BLOCK_DIR", type=_FOLDER)
+@click.argument("out", metavar="SCENE_DIR", type=click.Path(path_type=Path, file_okay=False))
+@click.option("--overwrite", is_flag=True, help="Replace a scene that is there already.")
+def urb3dcd_export(block: Path, out: Path, overwrite: bool) -> None:
+    """Write the simulated block in BLOCK_DIR as an Urb3DCD scene to SCENE_DIR."""
+    from loda_pdal.benchmark.urb3dcd import scene_of_block, write_scene
+
+    for path in write_scene(scene_of_block(block), out, overwrite=overwrite):
+        click.echo(path)
+
+
+@bench.command()
 @click.option("--first", type=click.IntRange(0), default=101, show_default=True, help="First seed.")
 @click.option(
     "--last", type=click.IntRange(0), default=130, show_default=True, help="Last seed; test seeds are skipped."

@@ -17,6 +17,7 @@ from loda_pdal.benchmark.blocks import split_of_name
 from loda_pdal.benchmark.metrics import Scores, markdown_table
 from loda_pdal.benchmark.protocols import ScoreReport, combined, judge, judge_instances
 from loda_pdal.model.errors import InputError
+from loda_pdal.model.pair import Pair
 from loda_pdal.params import Parameters
 from loda_pdal.pipeline import detect_changes
 
@@ -103,7 +104,7 @@ def run_baselines(
     reports: dict[str, list[ScoreReport]] = {}
     seconds: dict[str, float] = {}
 
-    def keep(name: str, block: Block, marks: Any, spent: float) -> None:
+    def keep(name: str, block: Block, marks: Pair[Marks], spent: float) -> None:
         reports.setdefault(name, []).append(judge(judged_points(block, marks), block.truth))
         seconds[name] = seconds.get(name, 0.0) + spent
         say(f"{block.name}: {name}, {spent:.1f} s")
@@ -116,7 +117,7 @@ def run_baselines(
             marks = found.points.map(lambda points: Marks(points.change, points.object.astype("int64")))
             keep(OURS, block, marks, time.perf_counter() - start)
         start = time.perf_counter()
-        scene = scene_of(block, parameters)
+        scene = scene_of(block.surveys, parameters)
         prepared = time.perf_counter() - start
         for method in methods:
             start = time.perf_counter()
@@ -139,35 +140,35 @@ def tune(
     methods, skipped = _methods(training, parameters, say)
     for name, reason in skipped.items():
         say(f"skipped: {name}, {reason}")
-    scenes = list(_scenes(folders, parameters))
-    return {method.name: _tuned(method, TUNED[preset][method.name], scenes, say) for method in methods}
+    known = list(_known(folders, parameters))
+    return {method.name: _tuned(method, TUNED[preset][method.name], known, say) for method in methods}
 
 
-def _tuned(method: Baseline, start: Any, scenes: Sequence[Scene], say: Say) -> Tuned:
+def _tuned(method: Baseline, start: Any, known: Sequence[tuple[Block, Scene]], say: Say) -> Tuned:
     """The best of a method's grid; of equally good ones the first."""
     best = Tuned(start, -1.0)
     slow = {name: values for name, values in method.grid.items() if name in method.measured_by}
     fast = {name: values for name, values in method.grid.items() if name not in method.measured_by}
     for chosen in _combinations(slow):
         base = replace(start, **chosen)
-        measured = [method.measure(scene, base) for scene in scenes]
+        measured = [method.measure(scene, base) for _, scene in known]
         for also_chosen in _combinations(fast):
             params = replace(base, **also_chosen)
-            found = _macro_iou(
-                (scene, scene.on_points(method.decide(scene, known, params)))
-                for scene, known in zip(scenes, measured, strict=True)
+            reached = _macro_iou(
+                (block, scene.on_points(method.decide(scene, found, params)))
+                for (block, scene), found in zip(known, measured, strict=True)
             )
-            if found > best.macro_iou:
-                best = Tuned(params, found)
+            if reached > best.macro_iou:
+                best = Tuned(params, reached)
         say(f"{method.name}: mIoU {100 * best.macro_iou:.1f} with {best.params}")
     return best
 
 
-def _macro_iou(answers: Iterable[tuple[Scene, Any]]) -> float:
+def _macro_iou(answers: Iterable[tuple[Block, Pair[Marks]]]) -> float:
     judgements = [
         j
-        for scene, marks in answers
-        for j in judge_instances(judged_points(scene.block, marks), scene.block.truth)
+        for block, marks in answers
+        for j in judge_instances(judged_points(block, marks), block.truth)
         if j.instance.is_evaluated
     ]
     scores = Scores.of([j.instance.label for j in judgements], [j.predicted for j in judgements])
@@ -188,19 +189,19 @@ def _methods(training: Sequence[Path], parameters: Parameters, say: Say) -> tupl
         skipped[forest.NAME] = "no training blocks were given (--train)."
     else:
         say(f"{forest.NAME}: training on {len(training)} blocks")
-        methods.append(forest.baseline(list(_scenes(training, parameters))))
+        methods.append(forest.baseline(list(_known(training, parameters))))
     return methods, skipped
 
 
-def _scenes(folders: Sequence[Path], parameters: Parameters) -> Iterator[Scene]:
-    """Scenes to choose parameters on or to train on; `InputError` for a test block."""
+def _known(folders: Sequence[Path], parameters: Parameters) -> Iterator[tuple[Block, Scene]]:
+    """Blocks and scenes to choose parameters on or to train on; `InputError` for a test block."""
     for folder in folders:
         block = read_block(folder)
         if split_of_name(f"seed {block.truth.made_by.get('seed')}") == "test":
             raise InputError(
                 f"{folder} is a test block.", "Tune and train on training or validation blocks.", "test-block"
             )
-        yield scene_of(block, parameters)
+        yield block, scene_of(block.surveys, parameters)
 
 
 def _missing(library: str) -> str:

@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from loda_pdal.benchmark.baselines.baseline import Baseline
 from loda_pdal.benchmark.baselines.columns import Columns, connected, marks_in_columns
-from loda_pdal.benchmark.baselines.scene import Marks, Scene
+from loda_pdal.benchmark.baselines.scene import Block, Marks, Scene
 from loda_pdal.kernels.parallel import thread_count
 from loda_pdal.model.cloud import FloatArray, Int64Array
 from loda_pdal.model.labels import ChangeLabel
@@ -55,14 +55,14 @@ class Measured(NamedTuple):
     columns: Columns
 
 
-def baseline(training: Sequence[Scene]) -> Baseline:
-    """The baseline, its forest trained on scenes of other blocks than it will be asked about."""
+def baseline(training: Sequence[tuple[Block, Scene]]) -> Baseline:
+    """The baseline, its forest trained on other blocks, and their scenes, than it will be asked about."""
     from sklearn.ensemble import RandomForestClassifier
 
     trees = RandomForestClassifier(
         N_TREES, min_samples_leaf=MIN_LEAF, class_weight="balanced_subsample", random_state=SEED, n_jobs=thread_count()
     )
-    features, labels = zip(*(_samples(scene) for scene in training), strict=True)
+    features, labels = zip(*(_samples(*known) for known in training), strict=True)
     trees.fit(np.concatenate(features), np.concatenate(labels))
 
     def measure(scene: Scene, params: ForestParams) -> Measured:
@@ -98,10 +98,10 @@ def decide(scene: Scene, measured: Measured, params: ForestParams) -> Pair[Marks
     return marks_in_columns(scene, measured.columns, region, np.concatenate(label))
 
 
-def _samples(scene: Scene) -> tuple[FloatArray, Int64Array]:
+def _samples(block: Block, scene: Scene) -> tuple[FloatArray, Int64Array]:
     """Features and labels of the cells that hold annotated instances."""
     columns = Columns.of(scene)
-    label = _labels(scene, columns)
+    label = _labels(block, scene, columns)
     cells = np.flatnonzero(label)
     return _features(scene, columns)[cells], label[cells]
 
@@ -140,15 +140,14 @@ def _profile(cell: Int64Array, height: FloatArray, is_off_ground: Any, columns: 
     return [n.astype(float), mean, spread, n_ground.astype(float)]
 
 
-def _labels(scene: Scene, columns: Columns) -> Int64Array:
+def _labels(block: Block, scene: Scene, columns: Columns) -> Int64Array:
     """Label of the instances that most points off the ground in each flat cell belong to; 0 where there are none."""
-    truth = scene.block.truth
-    of_instance = np.zeros(max(truth.by_id, default=0) + 1, dtype=np.int64)
-    for i in truth.instances:
+    of_instance = np.zeros(max(block.truth.by_id, default=0) + 1, dtype=np.int64)
+    for i in block.truth.instances:
         of_instance[i.instance_id] = i.label if i.is_evaluated else ChangeLabel.UNDETERMINED
     votes = np.zeros(columns.shape[0] * columns.shape[1] * _N_CODES)
     for cloud, cell, is_off_ground, epoch in zip(
-        scene.clouds, columns.cell, scene.is_off_ground, scene.block.epochs, strict=True
+        scene.clouds, columns.cell, scene.is_off_ground, block.epochs, strict=True
     ):
         label = of_instance[epoch.truth_id]
         is_counted = np.append(is_off_ground, False)[cloud.voxel_idx] & (label > 0)

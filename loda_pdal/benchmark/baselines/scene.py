@@ -55,18 +55,16 @@ class Block:
 
 @dataclass(frozen=True)
 class Scene:
-    """Both epochs of a block as every baseline gets them.
+    """Both surveys as every baseline gets them.
 
     Attributes
     ----------
-    block : Block
     clouds : Pair of VoxelCloud
         Fused points in one frame whose z is the common vertical.
     height : Pair of (m,) float64, m
         Of each fused point above the ground of its epoch; NaN where that is unknown.
     """
 
-    block: Block
     clouds: Pair[VoxelCloud]
     height: Pair[FloatArray]
 
@@ -118,13 +116,12 @@ def read_block(folder: Path) -> Block:
     return Block(folder.name, clouds.join(xyz, annotated), truth)
 
 
-def scene_of(block: Block, parameters: Parameters) -> Scene:
-    """The block fused, registered and with heights above ground, as our own method does it."""
-    surveys = block.surveys
+def scene_of(surveys: Pair[Survey], parameters: Parameters) -> Scene:
+    """Both surveys fused, registered and with heights above ground, as our own method does it."""
     p = resolve(parameters, surveys)
     fused = fuse_epochs(surveys, p)
     clouds = into_frame(fused, register_epochs(fused, p))
-    return Scene(block, clouds, model_ground(clouds, p).map(lambda ground: ground.height))
+    return Scene(clouds, model_ground(clouds, p).map(lambda ground: ground.height))
 
 
 def judged_points(block: Block, marks: Pair[Marks]) -> JudgedPoints:
