@@ -143,7 +143,7 @@ def method_of(name: str, known: dict[str, tuple[Block, Scene]]) -> Baseline:
 
 
 def report_of(method: Baseline, block: Block, scene: Scene) -> ScoreReport:
-    params = TUNED["aerial"][method.name]
+    params = TUNED["street"][method.name]
     marks = method.decide(scene, method.measure(scene, params), params)
     return judge(judged_points(block, scene.on_points(marks)), block.truth)
 

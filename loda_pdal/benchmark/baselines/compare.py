@@ -105,9 +105,10 @@ def run_baselines(
     seconds: dict[str, float] = {}
 
     def keep(name: str, block: Block, marks: Pair[Marks], spent: float) -> None:
-        reports.setdefault(name, []).append(judge(judged_points(block, marks), block.truth))
+        report = judge(judged_points(block, marks), block.truth)
+        reports.setdefault(name, []).append(report)
         seconds[name] = seconds.get(name, 0.0) + spent
-        say(f"{block.name}: {name}, {spent:.1f} s")
+        say(f"{block.name}: {name}, mIoU {100 * (report.scores().macro_iou or 0.0):.1f}, {spent:.1f} s")
 
     for folder in folders:
         block = read_block(folder)

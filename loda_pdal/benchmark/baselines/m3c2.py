@@ -7,6 +7,7 @@ either: a point has changed where its distance is significant, or where the othe
 from __future__ import annotations
 
 import logging
+import os
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -61,7 +62,8 @@ class Measured(NamedTuple):
 def measure(scene: Scene, params: M3c2Params) -> Measured:
     """M3C2 from all fused points of each epoch."""
     py4dgeo = _py4dgeo()
-    py4dgeo.set_num_threads(thread_count())
+    if "OMP_NUM_THREADS" not in os.environ:  # it would warn
+        py4dgeo.set_num_threads(thread_count())
     epochs = scene.clouds.map(lambda cloud: py4dgeo.Epoch(np.ascontiguousarray(cloud.xyz)))
 
     def distances(own: Any, other: Any) -> Distances:

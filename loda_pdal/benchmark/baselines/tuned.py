@@ -24,10 +24,10 @@ TUNED: dict[str, dict[str, Any]] = {
         "DSM random forest": ForestParams(min_probability=0.4, min_cells=8),
     },
     "aerial": {
-        "M3C2": M3c2Params(),
-        "nDSM difference": NdsmParams(),
-        "C2C": C2cParams(),
-        "DSM random forest": ForestParams(),
+        "M3C2": M3c2Params(radius_m=0.7, min_points=10, standing_m=0.5, depth_m=0.5, min_distance_m=0.35),
+        "nDSM difference": NdsmParams(threshold_m=0.8, opening=2, min_cells=1, standing_m=0.5),
+        "C2C": C2cParams(radius_m=0.7, min_points=5, standing_m=0.5, threshold_m=0.7),
+        "DSM random forest": ForestParams(min_probability=0.5, min_cells=1),
     },
 }
 """Parameters by preset and name of the method."""
