@@ -7,8 +7,8 @@ The twist (tx, ty, tz, rx, ry, rz) is applied about the origin of the frame, aft
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from loda_pdal.kernels.compiled import inner, kernel
 from loda_pdal.kernels.neighbours import k_nearest
 
 CHUNK = 2048
@@ -29,7 +29,7 @@ ROUNDING_M = 1e-9
 """More than distances are wrong by for rounding, m."""
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def plane_chunks(  # type: ignore[no-untyped-def]
     start, stop, source, source_normals, R, t, R_last, t_last, cells, target, normals, sq_sigma, radius, min_cosine,
     tau, is_robust, match, clearance, residual, weight, sums,
@@ -92,7 +92,7 @@ def plane_chunks(  # type: ignore[no-untyped-def]
             total[SCORE] += tukey * r * r
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def distribution_chunks(start, stop, source, R, t, cells, distribution, radius, outlier, sums):  # type: ignore[no-untyped-def]
     """Point-to-distribution pairs of the source points in chunks [start, stop).
 
@@ -158,7 +158,7 @@ def distribution_chunks(start, stop, source, R, t, cells, distribution, radius, 
             _add_block(total, x, y, z, w * bx, w * by, w * bz, w * xx, w * xy, w * xz, w * yy, w * yz, w * zz)
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _fill_slot(cells, i, j, k, radius, slots, slot, near, n_near):  # type: ignore[no-untyped-def]
     """List the sorted points within ``radius`` of a cube. Cubes have the edge of the cells and begin where they do.
 
@@ -186,7 +186,7 @@ def _fill_slot(cells, i, j, k, radius, slots, slot, near, n_near):  # type: igno
     return n_near
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _first_at_least(values, a, b, least):  # type: ignore[no-untyped-def]
     """First of the ascending values [a, b) that is at least ``least``; b if none is."""
     while a < b:
@@ -198,7 +198,7 @@ def _first_at_least(values, a, b, least):  # type: ignore[no-untyped-def]
     return a
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def plane_blocks(xyz, normals, residual, weight, block, sums):  # type: ignore[no-untyped-def]
     """Point-to-plane pairs summed by block: ``block`` (k,) of each pair, points (k, 3) float64 after the pose, normals.
 
@@ -211,7 +211,7 @@ def plane_blocks(xyz, normals, residual, weight, block, sums):  # type: ignore[n
         _add(sums[block[i]], J, weight[i], residual[i])
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def nearest_to_means(xyz, voxel, mean, kept):  # type: ignore[no-untyped-def]
     """Of the points (m, 3) of each voxel, the one nearest to its mean (v, 3); the first of equally near ones.
 
@@ -225,7 +225,7 @@ def nearest_to_means(xyz, voxel, mean, kept):  # type: ignore[no-untyped-def]
             best_sq[v], kept[v] = sq, i
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def sum_products(xyz, voxel, mean, products):  # type: ignore[no-untyped-def]
     """Add the products xx, xy, xz, yy, yz, zz of each point's (m, 3) offset from its voxel's mean to (v, 6)."""
     for i in range(len(xyz)):
@@ -239,13 +239,13 @@ def sum_products(xyz, voxel, mean, products):  # type: ignore[no-untyped-def]
         products[v, 5] += z * z
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _moved(R, t, x, y, z):  # type: ignore[no-untyped-def]
     x, y, z = _turned(R, x, y, z)
     return x + t[0], y + t[1], z + t[2]
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _turned(R, x, y, z):  # type: ignore[no-untyped-def]
     return (
         R[0, 0] * x + R[0, 1] * y + R[0, 2] * z,
@@ -254,19 +254,19 @@ def _turned(R, x, y, z):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _sq_length(x, y, z):  # type: ignore[no-untyped-def]
     return x * x + y * y + z * z
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _fill_row(J, x, y, z, nx, ny, nz):  # type: ignore[no-untyped-def]
     """Row of the Jacobian of a point's distance along a normal: the normal, and its moment about the origin."""
     J[0], J[1], J[2] = nx, ny, nz
     J[3], J[4], J[5] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _add(total, J, w, r):  # type: ignore[no-untyped-def]
     """Add one residual with row ``J`` of the Jacobian."""
     k = 0
@@ -277,7 +277,7 @@ def _add(total, J, w, r):  # type: ignore[no-untyped-def]
         total[21 + a] += w * J[a] * r
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _add_block(total, x, y, z, bx, by, bz, xx, xy, xz, yy, yz, zz):  # type: ignore[no-untyped-def]
     """Add a 3D residual at (x, y, z) with Jacobian J = [I, -[p]x], given B and B d: J'BJ and J'Bd."""
     # rows of B [p]x, so that J'BJ = [[B, -B[p]x], [., [p]x' B [p]x]]

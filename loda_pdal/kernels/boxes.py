@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from loda_pdal.kernels.compiled import inner, kernel
 
 Array = npt.NDArray[Any]
 
@@ -16,7 +17,7 @@ _MOST_CORNERS = 16
 """A rectangle cut by six half-spaces has at most ten corners."""
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def drop_inner_points(first: int, last: int, xy: Array, order: Array, starts: Array, label: Array) -> None:
     """Set the label of plan points to -1 that are surely no corners of the convex hull of their group.
 
@@ -53,7 +54,7 @@ def drop_inner_points(first: int, last: int, xy: Array, order: Array, starts: Ar
                 label[order[t]] = -1
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def smallest_rectangles(
     first: int, last: int, xy: Array, order: Array, starts: Array, centre: Array, along: Array, size: Array
 ) -> None:
@@ -104,7 +105,7 @@ def smallest_rectangles(
                 size[group, 0], size[group, 1] = length, width
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _hull(points: Array) -> Array:
     """Corners of the convex hull of sorted (n, 2) points, counterclockwise from the lowest x (monotone chain)."""
     n = len(points)
@@ -118,7 +119,7 @@ def _hull(points: Array) -> Array:
     return hull[: max(k - 1, 1)]
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _push_corner(hull: Array, k: int, fixed: int, point: Array) -> int:
     """Append a point to the chain of ``k`` corners, after those that no longer turn left; the new count."""
     while k - fixed >= 2:
@@ -131,7 +132,7 @@ def _push_corner(hull: Array, k: int, fixed: int, point: Array) -> int:
     return k + 1
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def shared_volumes(
     first: int,
     last: int,
@@ -158,7 +159,7 @@ def shared_volumes(
         volume[p] = max(0.5 * (one + two), 0.0)
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _shared(centre_a: Array, axes_a: Array, size_a: Array, centre_b: Array, axes_b: Array, size_b: Array) -> float:
     """Volume that boxes a and b share; a face that both have counts for a only."""
     offset = centre_b - centre_a
@@ -174,7 +175,7 @@ def _shared(centre_a: Array, axes_a: Array, size_a: Array, centre_b: Array, axes
     return float(volume) / 3.0
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _faces_inside(
     centre: Array, axes: Array, size: Array, other_centre: Array, other_axes: Array, other_size: Array, slack: float
 ) -> float:
@@ -214,7 +215,7 @@ def _faces_inside(
     return total
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _clip(polygon: Array, n: int, sign: float, axis: Array, centre: Array, limit: float, scratch: Array) -> int:
     """Cut a polygon in place to ``sign * axis . (p - centre) <= limit``; the new number of corners."""
     k = 0
@@ -239,7 +240,7 @@ def _clip(polygon: Array, n: int, sign: float, axis: Array, centre: Array, limit
     return k
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _area_along(polygon: Array, n: int, normal: Array) -> float:
     """Area of a plane convex polygon with a unit normal, whichever way round its corners go."""
     total = 0.0

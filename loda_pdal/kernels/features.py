@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from loda_pdal.kernels.blocks import around, box_of, hits_within, measure
+from loda_pdal.kernels.compiled import inner, kernel
 from loda_pdal.kernels.geometry import eigen_symmetric_3x3
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def shape_features(  # type: ignore[no-untyped-def]
     start, stop, room, blocks, cells, radius, min_neighbours, values, normals, is_valid
 ):
@@ -30,7 +30,7 @@ def shape_features(  # type: ignore[no-untyped-def]
     return stop
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _shape(room, n, x, y, z, smallest, i, values, normals, is_valid):  # type: ignore[no-untyped-def]
     """Write features at ``i``, of ``n`` hits around (x, y, z), unless these are all in one place."""
     sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0

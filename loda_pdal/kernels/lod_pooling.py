@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from loda_pdal.kernels.cells import empty_runs, runs_within, sq_distance
+from loda_pdal.kernels.compiled import inner, kernel
 from loda_pdal.kernels.geometry import eigen_symmetric_3x3
 from loda_pdal.kernels.planes import LINE
 
@@ -16,7 +16,7 @@ TRIM = 3.0
 """Points farther than this many standard deviations from the median leave the mean offset."""
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def pool_range(  # type: ignore[no-untyped-def]
     start, stop, before, after, centres, radius, min_points, max_isotropy, n_points, normal, sigma, offset, is_valid
 ):
@@ -46,7 +46,7 @@ def pool_range(  # type: ignore[no-untyped-def]
         is_valid[c] = True
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _gather(cells, x, y, z, radius, runs, points):  # type: ignore[no-untyped-def]
     """Points within ``radius``, about (x, y, z), in a buffer that is enlarged where needed; how many."""
     n_runs = runs_within(cells, x, y, z, radius, runs)
@@ -66,7 +66,7 @@ def _gather(cells, x, y, z, radius, runs, points):  # type: ignore[no-untyped-de
     return points, n
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _covariance(points, n):  # type: ignore[no-untyped-def]
     """xx, xy, xz, yy, yz, zz of the first ``n`` points about their mean."""
     mx, my, mz = 0.0, 0.0, 0.0
@@ -87,7 +87,7 @@ def _covariance(points, n):  # type: ignore[no-untyped-def]
     return total / n
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _offset_and_noise(points, n, nx, ny, nz):  # type: ignore[no-untyped-def]
     """Trimmed mean offset along the normal and its standard deviation from the MAD, both in m."""
     along = np.empty(n)
@@ -103,7 +103,7 @@ def _offset_and_noise(points, n, nx, ny, nz):  # type: ignore[no-untyped-def]
     return (total / count if count > 0 else middle), sigma
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def limit_range(start, stop, xyz, cells, cell_m, lod95, is_valid, otherwise, result):  # type: ignore[no-untyped-def]
     """Limits (m) at points [start, stop), linear between the valid ones of the eight cell centres around each.
 
@@ -142,7 +142,7 @@ def limit_range(start, stop, xyz, cells, cell_m, lod95, is_valid, otherwise, res
         result[p] = total / weight if weight > 1e-6 else otherwise
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _first_cell(cells, i, j, k):  # type: ignore[no-untyped-def]
     """First of the cells that does not come before (i, j, k)."""
     a, b = 0, len(cells)
@@ -155,7 +155,7 @@ def _first_cell(cells, i, j, k):  # type: ignore[no-untyped-def]
     return a
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _place_in_column(cells, first, i, j, k):  # type: ignore[no-untyped-def]
     """Which of the cells from ``first`` on is (i, j, k), at most two are asked; -1 if neither."""
     for c in range(first, min(first + 2, len(cells))):

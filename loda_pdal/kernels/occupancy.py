@@ -7,10 +7,11 @@ Points are sorted by slot, two for each voxel: ``2 v`` holds the points that the
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from loda_pdal.kernels.compiled import kernel
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def holder_range(start, stop, starts, owner, n_raw, n, holder, n_held):  # type: ignore[no-untyped-def]
     """Object that has each slot [start, stop): the one with most raw points in it, the lowest of several.
 
@@ -43,7 +44,7 @@ def holder_range(start, stop, starts, owner, n_raw, n, holder, n_held):  # type:
         holder[slot], n_held[slot] = best, most
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def column_top_range(start, stop, columns, starts, owner, z, is_counted, n, column_owner, top):  # type: ignore[no-untyped-def]
     """Highest point that each object has in each of the columns [start, stop), by epoch.
 
@@ -82,7 +83,7 @@ def column_top_range(start, stop, columns, starts, owner, z, is_counted, n, colu
             entry[column_owner[e]] = -1
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def shared_column_range(start, stop, columns, holder, n, is_shared):  # type: ignore[no-untyped-def]
     """Which slots of the columns [start, stop) belong to an object that holds voxels of the column in both epochs.
 
