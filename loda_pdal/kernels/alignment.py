@@ -56,11 +56,11 @@ def plane_chunks(  # type: ignore[no-untyped-def]
     sums : (chunks, N_SUMS) float64
         Filled; ``SCORE`` is the weighted square sum of residuals and ``WEIGHT`` the weights without 1 / sigma^2.
     """
-    best_sq, best_idx = np.empty(2, dtype=np.float64), np.empty(2, dtype=np.int32)
-    J = np.empty(6, dtype=np.float64)
+    best_sq, best_idx, J = np.empty(2), np.empty(2, dtype=np.int32), np.empty(6)
     for chunk in range(start, stop):
         total = sums[chunk]
-        total[:] = 0.0
+        for s in range(N_SUMS):
+            total[s] = 0.0
         guess = min(cells.cell_m, radius)
         for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(source))):
             residual[i] = weight[i] = 0.0
@@ -119,10 +119,11 @@ def distribution_chunks(start, stop, source, R, t, cells, distribution, radius, 
     near = np.empty(16 * N_SLOTS + 2 * len(cells.xyz), dtype=np.int32)
     within = np.empty(len(cells.xyz) + 1, dtype=np.int32)
     edge, x0, y0, z0 = cells.cell_m, cells.low[0], cells.low[1], cells.low[2]
-    n_near = 0
+    n_near = np.int64(0)
     for chunk in range(start, stop):
         total = sums[chunk]
-        total[:] = 0.0
+        for s in range(N_SUMS):
+            total[s] = 0.0
         for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(source))):
             x, y, z = _moved(R, t, source[i, 0], source[i, 1], source[i, 2])
             cx, cy, cz = int(np.floor((x - x0) / edge)), int(np.floor((y - y0) / edge)), int(np.floor((z - z0) / edge))
@@ -168,13 +169,14 @@ def _fill_slot(cells, i, j, k, radius, slots, slot, near, n_near):  # type: igno
     edge, low = cells.cell_m, cells.low
     if n_near + len(cells.xyz) > len(near):
         n_near = 0
-        slots[:, 4] = 0
+        for s in range(N_SLOTS):
+            slots[s, 4] = 0
     slots[slot, 0], slots[slot, 1], slots[slot, 2], slots[slot, 3] = i, j, k, n_near
     x, y, z = low[0] + (i + 0.5) * edge, low[1] + (j + 0.5) * edge, low[2] + (k + 0.5) * edge
     n = int(radius / edge) + 1
     for row in range(max(i - n, 0), min(i + n + 1, len(cells.row_start) - 1)):
         end = cells.row_start[row + 1]
-        first = _first_at_least(cells.column_y, cells.row_start[row], end, j - n)
+        first = _first_at_least(cells.column_y, np.int64(cells.row_start[row]), end, j - n)
         last = _first_at_least(cells.column_y, first, end, j + n + 1)
         for p in range(cells.column_start[first], cells.column_start[last]):
             dx = max(abs(cells.xyz[p, 0] - x) - 0.5 * edge, 0.0)
@@ -204,7 +206,7 @@ def plane_blocks(xyz, normals, residual, weight, block, sums):  # type: ignore[n
 
     ``sums`` (blocks, `N_SUMS`) is added to, in the order of the pairs.
     """
-    J = np.empty(6, dtype=np.float64)
+    J = np.empty(6)
     for i in range(len(xyz)):
         x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
         _fill_row(J, x, y, z, np.float64(normals[i, 0]), np.float64(normals[i, 1]), np.float64(normals[i, 2]))
@@ -217,7 +219,9 @@ def nearest_to_means(xyz, voxel, mean, kept):  # type: ignore[no-untyped-def]
 
     ``kept`` (v,) int64 is filled with their indices; ``voxel`` (m,) int32 leaves none empty.
     """
-    best_sq = np.full(len(mean), np.inf)
+    best_sq = np.empty(len(mean))
+    for v in range(len(mean)):
+        best_sq[v] = np.inf
     for i in range(len(xyz)):
         v = voxel[i]
         sq = _sq_length(xyz[i, 0] - mean[v, 0], xyz[i, 1] - mean[v, 1], xyz[i, 2] - mean[v, 2])

@@ -4,14 +4,14 @@ Queries are a cell list too, often that of the cloud itself. A block is a piece 
 wide; the points around it are copied once, coordinate by coordinate, and each query runs over these short arrays. A
 kernel of your own that visits all points within a radius reads::
 
-    @njit(nogil=True, cache=True)
+    @kernel
     def _count_range(start, stop, room, blocks, queries, cells, radius, counts):
         for block in range(start, stop):
             n = around(room, cells, box_of(queries, blocks[block], blocks[block + 1]), radius)
             if n < 0:
                 return block
             for q in range(blocks[block], blocks[block + 1]):
-                measure(room, n, queries.xyz[q, 0], queries.xyz[q, 1], queries.xyz[q, 2])
+                measure(room, n, queries, q)
                 counts[queries.idx[q]] = hits_within(room, n, radius * radius)
                 # room.idx[room.hit[h]] is the index of a point within the radius
         return stop
@@ -186,9 +186,9 @@ def around(room, cells, box, radius):  # type: ignore[no-untyped-def]
 
 
 @inner
-def measure(room, n, x, y, z):  # type: ignore[no-untyped-def]
-    """Fill the squared distances of the first ``n`` points from (x, y, z), float64."""
-    x, y, z = np.float64(x), np.float64(y), np.float64(z)
+def measure(room, n, queries, q):  # type: ignore[no-untyped-def]
+    """Fill the squared distances of the first ``n`` points from sorted query ``q``, float64."""
+    x, y, z = np.float64(queries.xyz[q, 0]), np.float64(queries.xyz[q, 1]), np.float64(queries.xyz[q, 2])
     for j in range(n):
         dx, dy, dz = np.float64(room.x[j]) - x, np.float64(room.y[j]) - y, np.float64(room.z[j]) - z
         room.sq[j] = dx * dx + dy * dy + dz * dz
@@ -228,7 +228,7 @@ def nearest_of_block(room, queries, start, stop, cells, guess, max_distance):  #
             if room.n_nearest[row] >= 0:
                 continue
             q = start + row
-            measure(room, n, queries.xyz[q, 0], queries.xyz[q, 1], queries.xyz[q, 2])
+            measure(room, n, queries, q)
             n_found = _sort_hits(room, n, min(sq_expected, radius * radius), row)
             if n_found < k and sq_expected < radius * radius:
                 n_found = _sort_hits(room, n, radius * radius, row)
@@ -257,7 +257,7 @@ def _sort_hits(room, n, sq_radius, row):  # type: ignore[no-untyped-def]
     """Fill a row with the nearest of the measured points within; how many there are."""
     n_hits = hits_within(room, n, sq_radius)
     _order_by_ring(room, n_hits, sq_radius)
-    n_found = 0
+    n_found = np.int64(0)
     for h in range(n_hits):
         j = room.order[h]
         n_found = insert(room.sq[j], room.idx[j], room.best_sq, room.best_idx, n_found)

@@ -6,7 +6,7 @@ about distances depends neither on the cell size nor on the number of threads.
 
 A kernel of your own that visits all points within a radius of a few queries reads::
 
-    @njit(nogil=True, cache=True)
+    @kernel
     def _count_range(start, stop, cells, queries, radius, counts):
         runs = empty_runs(cells, radius)
         for q in range(start, stop):

@@ -124,12 +124,12 @@ def _link(cells, radius, reach, index, parent):  # type: ignore[no-untyped-def]
     The trees are grown in the order of the list, where neighbours stand close together, and then handed to ``parent``.
     """
     n = len(cells.xyz)
-    tree = np.arange(n, dtype=np.int32)
+    tree = np.empty(n, dtype=np.int32)
     runs = empty_runs(cells, radius)
     limit = radius
     for q in range(n):
         x, y, z = cells.xyz[q, 0], cells.xyz[q, 1], cells.xyz[q, 2]
-        root = q
+        tree[q] = root = q
         for r in range(runs_within(cells, x, y, z, radius, runs)):
             for p in range(runs[r, 0], min(runs[r, 1], q)):
                 if tree[p] == root:
@@ -139,7 +139,7 @@ def _link(cells, radius, reach, index, parent):  # type: ignore[no-untyped-def]
                 if sq_distance(cells, p, x, y, z) <= limit * limit:
                     root = _join(tree, root, p)
     for q in range(n):
-        _join(parent, index[cells.idx[q]], index[cells.idx[tree[q]]])
+        _join(parent, np.int64(index[cells.idx[q]]), np.int64(index[cells.idx[tree[q]]]))
 
 
 @kernel
@@ -193,7 +193,7 @@ def _count_range(start, stop, cells, radius, enough, counts):  # type: ignore[no
 @kernel
 def _join_pairs(pairs, parent):  # type: ignore[no-untyped-def]
     for e in range(len(pairs)):
-        _join(parent, pairs[e, 0], pairs[e, 1])
+        _join(parent, np.int64(pairs[e, 0]), np.int64(pairs[e, 1]))
 
 
 @kernel
@@ -206,7 +206,7 @@ def _join_smooth(neighbour, normals, labels, least_cosine, parent):  # type: ign
             for d in range(3):
                 cosine += np.float64(normals[i, d]) * np.float64(normals[j, d])
             if abs(cosine) > least_cosine:
-                _join(parent, i, j)
+                _join(parent, i, np.int64(j))
 
 
 @inner

@@ -7,28 +7,27 @@ an inner one none for Python either.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 from numba import njit
 
-Loop = TypeVar("Loop", bound=Callable[..., Any])
+Loop = Callable[..., Any]
 
 
-def kernel(loop: Loop) -> Loop:
+def kernel(loop: Loop) -> Any:
     """A function that Python and other kernels call. Divisions by zero follow IEEE 754, those of integers are a bug."""
     return _compiled(loop)
 
 
-def inner(loop: Loop) -> Loop:
+def inner(loop: Loop) -> Any:
     """A function that only kernels call: it cannot be called from Python."""
     return _compiled(loop, no_cpython_wrapper=True)
 
 
-def inlined(loop: Loop) -> Loop:
+def inlined(loop: Loop) -> Any:
     """An inner function whose statements stand in those that call it."""
     return _compiled(loop, no_cpython_wrapper=True, inline="always")
 
 
-def _compiled(loop: Loop, **options: Any) -> Loop:
-    compiled: Loop = njit(loop, nogil=True, cache=True, error_model="numpy", no_cfunc_wrapper=True, **options)
-    return compiled
+def _compiled(loop: Loop, **options: Any) -> Any:
+    return njit(loop, nogil=True, cache=True, error_model="numpy", no_cfunc_wrapper=True, **options)

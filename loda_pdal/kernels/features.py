@@ -23,7 +23,7 @@ def shape_features(  # type: ignore[no-untyped-def]
             return block
         for q in range(blocks[block], blocks[block + 1]):
             x, y, z = np.float64(cells.xyz[q, 0]), np.float64(cells.xyz[q, 1]), np.float64(cells.xyz[q, 2])
-            measure(room, n, x, y, z)
+            measure(room, n, cells, q)
             n_hits = hits_within(room, n, radius * radius)
             if n_hits >= min_neighbours:
                 _shape(room, n_hits, x, y, z, 1e-12 * radius * radius, cells.idx[q], values, normals, is_valid)

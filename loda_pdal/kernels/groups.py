@@ -87,7 +87,7 @@ def quantile_range(
     """
     picked = np.empty(_largest(first, last, starts))
     for group in range(first, last):
-        n = 0
+        n = np.int64(0)
         for t in range(starts[group], starts[group + 1]):
             picked[n] = values[order[t]]
             n += not np.isnan(picked[n])
@@ -96,8 +96,10 @@ def quantile_range(
         place = starts[group] + q * (n - 1)  # as if all groups stood sorted behind each other
         part = place - np.floor(place)
         low = int(np.floor(place)) - starts[group]
-        lower = _select(picked, n, low)
-        upper = lower if low + 1 == n else np.min(picked[low + 1 : n])
+        lower = select(picked, n, low)
+        upper = lower if low + 1 == n else np.inf
+        for t in range(low + 1, n):
+            upper = min(upper, picked[t])
         quantile[group] = lower * (1 - part) + upper * part
 
 
@@ -111,7 +113,7 @@ def _largest(first: int, last: int, starts: Array) -> int:
 
 
 @inner
-def _select(values: Array, n: int, rank: int) -> float:
+def select(values: Array, n: int, rank: int) -> float:
     """Value of that rank among the first ``n``, which are reordered: none before is larger, none behind smaller.
 
     Hoare's selection; pivots are drawn by a fixed generator, so that no order of the values makes it slow.

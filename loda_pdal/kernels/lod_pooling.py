@@ -7,6 +7,7 @@ import numpy as np
 from loda_pdal.kernels.cells import empty_runs, runs_within, sq_distance
 from loda_pdal.kernels.compiled import inner, kernel
 from loda_pdal.kernels.geometry import eigen_symmetric_3x3
+from loda_pdal.kernels.groups import select
 from loda_pdal.kernels.planes import LINE
 
 MAD_TO_STD = 1.4826
@@ -35,9 +36,15 @@ def pool_range(  # type: ignore[no-untyped-def]
         n_points[c, 0], n_points[c, 1] = n_b, n_a
         if n_b < min_points or n_a < min_points:
             continue
-        own_b, own_a = _covariance(points_b, n_b), _covariance(points_a, n_a)
-        mean = 0.5 * (own_b + own_a)
-        large, middle, small, nx, ny, nz = eigen_symmetric_3x3(mean[0], mean[1], mean[2], mean[3], mean[4], mean[5])
+        b, a = _covariance(points_b, n_b), _covariance(points_a, n_a)
+        large, middle, small, nx, ny, nz = eigen_symmetric_3x3(
+            0.5 * (b[0] + a[0]),
+            0.5 * (b[1] + a[1]),
+            0.5 * (b[2] + a[2]),
+            0.5 * (b[3] + a[3]),
+            0.5 * (b[4] + a[4]),
+            0.5 * (b[5] + a[5]),
+        )
         if middle <= LINE * large or small > max_isotropy * middle:
             continue
         normal[c, 0], normal[c, 1], normal[c, 2] = nx, ny, nz
@@ -75,32 +82,43 @@ def _covariance(points, n):  # type: ignore[no-untyped-def]
         my += points[p, 1]
         mz += points[p, 2]
     mx, my, mz = mx / n, my / n, mz / n
-    total = np.zeros(6)
+    xx = xy = xz = yy = yz = zz = 0.0
     for p in range(n):
         x, y, z = points[p, 0] - mx, points[p, 1] - my, points[p, 2] - mz
-        total[0] += x * x
-        total[1] += x * y
-        total[2] += x * z
-        total[3] += y * y
-        total[4] += y * z
-        total[5] += z * z
-    return total / n
+        xx, xy, xz = xx + x * x, xy + x * y, xz + x * z
+        yy, yz, zz = yy + y * y, yz + y * z, zz + z * z
+    return xx / n, xy / n, xz / n, yy / n, yz / n, zz / n
 
 
 @inner
 def _offset_and_noise(points, n, nx, ny, nz):  # type: ignore[no-untyped-def]
     """Trimmed mean offset along the normal and its standard deviation from the MAD, both in m."""
-    along = np.empty(n)
+    along, room = np.empty(n), np.empty(n)
     for p in range(n):
         along[p] = points[p, 0] * nx + points[p, 1] * ny + points[p, 2] * nz
-    middle = np.median(along)
-    sigma = MAD_TO_STD * np.median(np.abs(along - middle))
+        room[p] = along[p]
+    middle = _median(room, n)
+    for p in range(n):
+        room[p] = abs(along[p] - middle)
+    sigma = MAD_TO_STD * _median(room, n)
     total, count = 0.0, 0
     for p in range(n):
         if abs(along[p] - middle) <= TRIM * sigma:
             total += along[p]
             count += 1
     return (total / count if count > 0 else middle), sigma
+
+
+@inner
+def _median(values, n):  # type: ignore[no-untyped-def]
+    """Median of ``n`` values, which are reordered."""
+    upper = select(values, n, n // 2)
+    if n % 2:
+        return upper
+    lower = values[0]
+    for p in range(1, n // 2):
+        lower = max(lower, values[p])
+    return 0.5 * (lower + upper)
 
 
 @kernel

@@ -170,7 +170,7 @@ def k_nearest(cells, x, y, z, guess, max_distance, skip, best_sq, best_idx):  # 
 def k_within(cells, x, y, z, radius, skip, best_sq, best_idx):  # type: ignore[no-untyped-def]
     """The k best of the points within ``radius``, by (distance, index), into ``best_*``; how many were found."""
     k = len(best_sq)
-    n_found = 0
+    n_found = np.int64(0)
     limit = radius * radius
     reach = radius * (1 + 1e-9)
     first_row, last_row = cells_between(x - reach - cells.low[0], x + reach - cells.low[0], cells.cell_m)

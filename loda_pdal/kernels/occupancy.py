@@ -62,7 +62,9 @@ def column_top_range(start, stop, columns, starts, owner, z, is_counted, n, colu
         One entry for each object in each column, in the places of the column's points; all else stays as it is.
         ``top`` is NaN in the epoch in which the object has no point there.
     """
-    entry = np.full(n, -1, dtype=np.int64)
+    entry = np.empty(n, dtype=np.int64)
+    for owned in range(n):
+        entry[owned] = -1
     for column in range(start, stop):
         first = starts[2 * columns[column]]
         last = first
@@ -98,12 +100,14 @@ def shared_column_range(start, stop, columns, holder, n, is_shared):  # type: ig
     is_shared : (c, 2) bool
         Filled.
     """
-    is_in = np.zeros((n + 1, 2), dtype=np.bool_)  # the last is none
+    is_in = np.empty((n + 1, 2), dtype=np.bool_)  # the last is none
+    for owned in range(n + 1):
+        is_in[owned, 0] = is_in[owned, 1] = False
     for column in range(start, stop):
         for epoch in range(2):
             for v in range(columns[column], columns[column + 1]):
                 is_in[holder[v, epoch], epoch] = True
-        is_in[n] = False
+        is_in[n, 0] = is_in[n, 1] = False
         for epoch in range(2):
             for v in range(columns[column], columns[column + 1]):
                 is_shared[v, epoch] = is_in[holder[v, epoch], 0] and is_in[holder[v, epoch], 1]

@@ -115,7 +115,9 @@ def symmetric_arcs(neighbours: Array) -> tuple[Array, Array]:
                 place[j] += 1
 
     first_arc = np.zeros(n + 1, np.int32)
-    met = np.full(n, -1, np.int32)  # the last node that met this one
+    met = np.empty(n, np.int32)  # the last node that met this one
+    for i in range(n):
+        met[i] = -1
     for i in range(n):
         n_arcs = first_lister[i + 1] - first_lister[i]
         for s in range(first_lister[i], first_lister[i + 1]):
@@ -169,7 +171,8 @@ def rank_bits(bits: Array, rank: int) -> int:
     while n_below + counts[high] <= rank:
         n_below += counts[high]
         high += 1
-    counts[:] = 0
+    for half in range(len(counts)):
+        counts[half] = 0
     for value in bits:
         counts[value & 0xFFFF] += value >> 16 == high
     low = 0
@@ -306,7 +309,7 @@ def fit_regions(
     for region in range(len(is_stale)):
         if is_stale[region]:
             low, high = start[region], start[region + 1]
-            _gather(features, order, low, high, columns, 0)
+            _gather(features, order, low, high, columns, np.int64(0))
             for d in range(N_FEATURES):
                 medians[region, d], deviations[region, d] = _median_and_deviation(columns[d], high - low)
 
@@ -362,7 +365,7 @@ def _refit_labels(
         is_stale[label] = False
         if size[label] == 0:
             continue
-        n = 0
+        n = np.int64(0)
         for s in range(node_start[label], node_start[label + 1]):
             low, high = start[node_order[s]], start[node_order[s] + 1]
             _gather(features, order, low, high, columns, n)
@@ -420,8 +423,9 @@ def move_nodes(
         n_unused += 1
     near_label = np.empty(1 + _widest(first_arc), np.int32)  # its own label first
     near_weight = np.zeros(n)  # weight towards each label; 0 but for the node in hand
-    is_stale = np.zeros(n, np.bool_)
-    is_shifted = np.ones(n, np.bool_)
+    is_stale, is_shifted = np.empty(n, np.bool_), np.empty(n, np.bool_)
+    for label in range(n):
+        is_stale[label], is_shifted[label] = False, True
     queue = np.empty(n + 1, np.int32)  # a ring
     visits = np.empty(n, np.uint8)  # how often a node was looked at in this sweep, `_QUEUED` added while it waits
 
@@ -636,7 +640,7 @@ def merge_partners(
             n_a, n_b = start[a + 1] - start[a], start[b + 1] - start[b]
             rise = 0.0
             if n_a + n_b > 2:
-                _gather(features, order, start[a], start[a + 1], columns, 0)
+                _gather(features, order, start[a], start[a + 1], columns, np.int64(0))
                 _gather(features, order, start[b], start[b + 1], columns, n_a)
             for d in range(N_FEATURES):
                 if n_a + n_b > 2:

@@ -10,13 +10,12 @@ from loda_pdal.kernels.compiled import kernel
 @kernel
 def find_shifted(keys, shift):  # type: ignore[no-untyped-def]
     """Place (k,) int32 of each key plus ``shift`` among the ascending distinct ``keys`` (k,) int64; -1 where none."""
-    place = np.full(len(keys), -1, dtype=np.int32)
+    place = np.empty(len(keys), dtype=np.int32)
     j = 0
     for i in range(len(keys)):
         while j < len(keys) and keys[j] < keys[i] + shift:
             j += 1
-        if j < len(keys) and keys[j] == keys[i] + shift:
-            place[i] = j
+        place[i] = j if j < len(keys) and keys[j] == keys[i] + shift else -1
     return place
 
 
