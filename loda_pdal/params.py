@@ -112,6 +112,12 @@ class OutlierParams(StageParams):
     is_enabled: bool = param(True, "remove statistical outliers")
     k: int = param(20, "neighbours whose mean distance is judged", symbol="k", low=1, high=200)
     std_multiplier: float = param(3.0, "standard deviations above the mean that make an outlier", low=0.1, high=20)
+    keep_voxels: int = param(
+        8, "outliers that hang together in clusters of this many are thin or far away and stay; 0: none", low=0, high=10000
+    )
+    keep_gap_m: float = param(
+        0.6, "largest gap within such a cluster", unit="m", low=0.05, high=20, is_length=True
+    )
 
 
 @dataclass(frozen=True)
@@ -679,6 +685,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
         "name": "aerial",
         "adapts_to_spacing": True,
         "fuse": {"leaf_m": 0.5},
+        "outliers": {"keep_voxels": 0},
         "normals": {"radius_m": 1.5},
         "icp": {"leaves_m": (2.0, 1.0, 0.5), "radii_m": (3.0, 1.5, 0.75)},
         "ground": {"max_object_m": 60.0, "min_voxels": 4},
@@ -711,7 +718,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
     },
     "paper": {
         "name": "paper",
-        "outliers": {"std_multiplier": 1.0},
+        "outliers": {"std_multiplier": 1.0, "keep_voxels": 0},
         "icp": {"covariance": "normal", "adapts_tukey": False},
         "ground": {"vertical": "ground"},
         "lod": {"pose_term": "translation", "small_sample": False, "drift_term": "none"},
