@@ -258,6 +258,9 @@ class AssociationParams(StageParams):
     unmatched_cost: float = param(3.0, "cost of leaving an object unmatched", low=0, high=100)
     solver: str = param("hungarian", "optimal or greedy assignment", choices=("hungarian", "greedy"))
     boxes: str = param("upright", "gravity-aligned boxes, or 3D principal axes", choices=("upright", "pca"))
+    splits_merged: bool = param(
+        True, "a thing that stands apart in one epoch is taken out of what it is merged with in the other"
+    )
 
 
 @dataclass(frozen=True)
@@ -686,6 +689,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
         "adapts_to_spacing": True,
         "fuse": {"leaf_m": 0.5},
         "outliers": {"keep_voxels": 0},
+        "association": {"splits_merged": False},
         "normals": {"radius_m": 1.5},
         "icp": {"leaves_m": (2.0, 1.0, 0.5), "radii_m": (3.0, 1.5, 0.75)},
         "ground": {"max_object_m": 60.0, "min_voxels": 4},
@@ -722,7 +726,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
         "icp": {"covariance": "normal", "adapts_tukey": False},
         "ground": {"vertical": "ground"},
         "lod": {"pose_term": "translation", "small_sample": False, "drift_term": "none"},
-        "association": {"boxes": "pca"},
+        "association": {"boxes": "pca", "splits_merged": False},
         "superpoints": {"absorb_below": 1},
         "semantics": {
             "vegetation_sphericity": 0.35,
