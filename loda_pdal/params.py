@@ -428,6 +428,11 @@ class ChangeParams(StageParams):
         low=0,
         high=1000,
     )
+    needs_sight: bool = param(
+        True,
+        "what is solid is gained or lost only where the other survey shows something beneath it and nothing of the same "
+        "object above it: else it was hidden",
+    )
     volume_sigmas: float = param(
         0.0, "gained less lost voxels must exceed this many times the root of their sum; 0: need not", low=0, high=100
     )
@@ -717,6 +722,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "volume_sigmas": 3.0,
             "vegetation_height_m": 0.8,
             "fills_buildings": True,
+            "needs_sight": False,
         },
         "observability": {"cell_m": 2.0},
     },
@@ -747,6 +753,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "backing_voxels": 0,
             "backing_share": 0.0,
             "min_expected_points": 0.0,
+            "needs_sight": False,
             "replaced_m": 0.0,
         },
     },

@@ -19,7 +19,7 @@ from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams, ConfidenceParams, ObservabilityParams
 from loda_pdal.stages.confidence import calibrated, raw_confidence
 from loda_pdal.stages.correspondence import rank_by_place
-from loda_pdal.stages.cues import Evidence, Surface, Voxels, cells_with_owners, sample_voxels, weigh
+from loda_pdal.stages.cues import Cells, Evidence, Surface, Voxels, cells_with_owners, sample_voxels, weigh
 from loda_pdal.stages.observability import Coverage
 from loda_pdal.stages.parts import Parts, dissolve, split_parts
 
@@ -83,15 +83,15 @@ def decide_changes(
     voxels = sample_voxels(surfaces, seen, lod, params)
     n = len(object_class)
     cast = _Cast(surfaces, object_class, np.full(n, -1, dtype=np.int32), np.zeros(n, np.bool_)).settled(voxels)
-    cells = cells_with_owners(voxels, cast.surfaces, len(cast), params)
+    cells = cast.cells(voxels, params)
     evidence = weigh(cells, cast.surfaces, len(cast), params)
     is_no_pair = np.array([_is_no_pair(cue, params) for cue in _rows(evidence, cast.object_class)], dtype=np.bool_)
     if is_no_pair.any():
         cast = cast.without_pairs(is_no_pair).settled(voxels)
-        cells = cells_with_owners(voxels, cast.surfaces, len(cast), params)
+        cells = cast.cells(voxels, params)
     if params.find_parts:
         cast = cast.with_parts(split_parts(cells, cast.surfaces, len(cast), params)).settled(voxels)
-        cells = cells_with_owners(voxels, cast.surfaces, len(cast), params)
+        cells = cast.cells(voxels, params)
     evidence = weigh(cells, cast.surfaces, len(cast), params)
     surfaces, object_class, parent, is_apart = cast.surfaces, cast.object_class, cast.parent, cast.is_apart
     cues = _rows(evidence, object_class)
@@ -131,6 +131,11 @@ class _Cast:
 
     def __len__(self) -> int:
         return len(self.object_class)
+
+    def cells(self, voxels: Voxels, params: ChangeParams) -> Cells:
+        """The voxels with their owners; all but vegetation is solid."""
+        is_solid = (self.object_class != ObjectClass.VEGETATION) & params.needs_sight
+        return cells_with_owners(voxels, self.surfaces, len(self), params, is_solid)
 
     def without_pairs(self, is_no_pair: BoolArray) -> _Cast:
         """The before and the after side of the marked objects as objects of their own."""

@@ -80,6 +80,8 @@ class Voxels:
         Whether that epoch has a surface within the query radius of the centre.
     is_covered : Pair of (c,) bool
         Whether that epoch saw the voxel's column.
+    is_over : Pair of (c,) bool
+        Whether that epoch has a return in the voxel's column beneath the voxel: its rays went in there.
     normal : (c, 3) float64
         Mean unit normal of both epochs' nearest surfaces, of either sign; zero where either surface is missing.
     displacement : (c,) float64, m
@@ -96,6 +98,7 @@ class Voxels:
     is_open: BoolArray
     is_near: Pair[BoolArray]
     is_covered: Pair[BoolArray]
+    is_over: Pair[BoolArray]
     normal: FloatArray
     displacement: FloatArray
     lod95: FloatArray
@@ -137,7 +140,8 @@ class Cells:
     owner : Pair of (c,) int32
         Object whose points occupy the voxel in that epoch, -1 where none.
     is_seen : Pair of (c,) bool
-        Whether that epoch saw the voxel's column, and would have hit what the other epoch shows there.
+        Whether that epoch saw the voxel's column, and would have hit what the other epoch shows there; of solid things
+        it must show something beneath the voxel, and nothing of the same object above it.
     """
 
     voxels: Voxels
@@ -245,21 +249,66 @@ def sample_voxels(
         is_open=np.concatenate(list(is_open))[order],
         is_near=found.map(lambda idx: idx >= 0),
         is_covered=coverage.map(lambda side: side.at(centre)) if coverage else Pair(always, always),
+        is_over=surfaces.map(lambda surface: _is_over(centre, cell, columns, surface.xyz, params.voxel_m)),
         normal=normal,
         displacement=displacement,
         lod95=lod.at(centre),
     )
 
 
-def cells_with_owners(voxels: Voxels, surfaces: Pair[Surface], n: int, params: ChangeParams) -> Cells:
-    """The voxels with their owners among objects 0 to ``n - 1``."""
+def cells_with_owners(
+    voxels: Voxels, surfaces: Pair[Surface], n: int, params: ChangeParams, is_solid: BoolArray | None = None
+) -> Cells:
+    """The voxels with their owners among objects 0 to ``n - 1``.
+
+    Of those that are solid, (n,) bool, what has other surface of the object above it in the other epoch, or no return of
+    that epoch beneath it, was hidden there and not seen: a wall behind a new porch has not gone.
+    """
     holder, points = voxels.holders(surfaces, n)
     owner, n_raw = (Pair(*np.ascontiguousarray(values.T)) for values in (holder, points))
     is_seen = voxels.is_covered
     if params.min_expected_points > 0:
         expected = _expected_points(owner, n_raw, n)
         is_seen = is_seen.join(expected, lambda seen, points: seen & (points >= params.min_expected_points))
+    if is_solid is not None and is_solid.any():
+        own = Pair(owner.after, owner.before)  # what each epoch should have seen is the other's
+        is_hidden = Pair(
+            ~voxels.is_over.before | _is_beneath(voxels, own.before, owner.before),
+            ~voxels.is_over.after | _is_beneath(voxels, own.after, owner.after),
+        )
+        solid = own.map(lambda side: np.append(is_solid, False)[side])
+        is_seen = is_seen.join(solid.join(is_hidden, np.logical_and), lambda seen, hidden: seen & ~hidden)
     return Cells(voxels, owner, is_seen)
+
+
+def _is_over(
+    centre: FloatArray, cell: Int64Array, columns: Int64Array, xyz: FloatArray, voxel_m: float
+) -> BoolArray:
+    """Whether any of the points (m, 3) lies in the column of each voxel (c,), beneath its centre."""
+    first = columns[:-1]
+    if len(first) == 0 or len(xyz) == 0:
+        return np.zeros(len(cell), np.bool_)
+    plan = cell[first, :2]
+    lattice = Lattice.around(plan)
+    column = lattice.find(lattice.keys(plan), cells_of(xyz[:, :2], voxel_m))
+    lowest = np.fmin(Groups(column, len(first)).minimum(xyz[:, 2]), np.inf)
+    return np.asarray(np.repeat(lowest, np.diff(columns)) < centre[:, 2])
+
+
+def _is_beneath(voxels: Voxels, owner: IntArray, other: IntArray) -> BoolArray:
+    """Whether the owner (c,) of each voxel has a voxel as high or higher in its column among ``other`` (c,) owners."""
+    column = np.repeat(np.arange(len(voxels.columns) - 1), np.diff(voxels.columns))
+    n = int(max(owner.max(initial=-1), other.max(initial=-1))) + 2
+    key = column * n + other
+    is_held = np.flatnonzero(other >= 0)
+    # voxels of a column ascend: the last of a key is its highest
+    keys, last = np.unique(key[is_held][::-1], return_index=True)
+    highest = is_held[len(is_held) - 1 - last]
+    place = np.minimum(np.searchsorted(keys, column * n + owner), max(len(keys) - 1, 0))
+    if len(keys) == 0:
+        return np.zeros(len(owner), np.bool_)
+    is_found = (keys[place] == column * n + owner) & (owner >= 0)
+    return np.asarray(is_found & (voxels.cell[highest[place], 2] >= voxels.cell[:, 2]))
 
 
 def _slots(cells: Pair[Int64Array]) -> tuple[Int64Array, Int64Array, Int64Array, Int64Array]:
