@@ -448,9 +448,17 @@ class ChangeParams(StageParams):
     part_of_length_m: float = param(
         15.0, "only objects longer than this are looked through for parts", unit="m", low=0, high=1000
     )
-    part_min_voxels: int = param(24, "occupancy voxels of the smallest part", low=1, high=10000)
+    part_min_voxels: int = param(12, "occupancy voxels of the smallest part", low=1, high=10000)
+    frontage_m: float = param(
+        6.0,
+        "width of a house in a row: what is built onto a house changes it, and this much of a longer row; 0: only the part "
+        "changes",
+        unit="m",
+        low=0,
+        high=100,
+    )
     part_is_new_m3: float = param(
-        80.0,
+        16.0,
         "a part of a building that only one survey has, and as large as this, is a building that was Added or Removed",
         unit="m3",
         low=0,
@@ -723,6 +731,9 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "vegetation_height_m": 0.8,
             "fills_buildings": True,
             "needs_sight": False,
+            "part_min_voxels": 24,
+            "part_is_new_m3": 80.0,
+            "frontage_m": 0.0,
         },
         "observability": {"cell_m": 2.0},
     },

@@ -82,7 +82,8 @@ def decide_changes(
     seen = coverage if observability.is_enabled or params.visible_only else None
     voxels = sample_voxels(surfaces, seen, lod, params)
     n = len(object_class)
-    cast = _Cast(surfaces, object_class, np.full(n, -1, dtype=np.int32), np.zeros(n, np.bool_)).settled(voxels)
+    no = np.zeros(n, np.bool_)
+    cast = _Cast(surfaces, object_class, np.full(n, -1, dtype=np.int32), no, no).settled(voxels)
     cells = cast.cells(voxels, params)
     evidence = weigh(cells, cast.surfaces, len(cast), params)
     is_no_pair = np.array([_is_no_pair(cue, params) for cue in _rows(evidence, cast.object_class)], dtype=np.bool_)
@@ -90,10 +91,12 @@ def decide_changes(
         cast = cast.without_pairs(is_no_pair).settled(voxels)
         cells = cast.cells(voxels, params)
     if params.find_parts:
-        cast = cast.with_parts(split_parts(cells, cast.surfaces, len(cast), params)).settled(voxels)
+        is_building = cast.object_class == ObjectClass.BUILDING
+        cast = cast.with_parts(split_parts(cells, cast.surfaces, is_building, len(cast), params)).settled(voxels)
         cells = cast.cells(voxels, params)
     evidence = weigh(cells, cast.surfaces, len(cast), params)
     surfaces, object_class, parent, is_apart = cast.surfaces, cast.object_class, cast.parent, cast.is_apart
+    carrier = np.append(cast.is_house, False)[parent]
     cues = _rows(evidence, object_class)
     verdicts = [
         _verdict(cue, apart, part, params, observability)
@@ -105,6 +108,9 @@ def decide_changes(
             for cue, v, apart in zip(cues, verdicts, is_apart.tolist(), strict=True)
         ]
     )
+    for i, part in _changed_houses(verdicts, parent, carrier, evidence.dv).items():
+        verdicts[i] = Verdict(verdicts[part].label, f"a part of it changed: {verdicts[part].reason}")
+        raw[i] = raw[part]
     sure = [calibrated(score, v.label, confidence) for score, v in zip(raw.tolist(), verdicts, strict=True)]
     label = np.array([v.label for v in verdicts], dtype=np.uint8)
     is_known = label != ChangeLabel.UNDETERMINED
@@ -122,12 +128,14 @@ def decide_changes(
 
 @dataclass(frozen=True)
 class _Cast:
-    """The objects as they stand: who owns which point, of which class, part of whom, and whether a pair was undone."""
+    """The objects as they stand: who owns which point, of which class, part of whom, whether a pair was undone, and
+    whether what changes a part of it changes it."""
 
     surfaces: Pair[Surface]
     object_class: ByteArray
     parent: IntArray
     is_apart: BoolArray
+    is_house: BoolArray
 
     def __len__(self) -> int:
         return len(self.object_class)
@@ -145,13 +153,16 @@ class _Cast:
             np.concatenate([self.object_class, self.object_class[partner]]),
             np.concatenate([self.parent, self.parent[partner]]),
             np.concatenate([self.is_apart | is_no_pair, np.ones(len(partner), np.bool_)]),
+            np.concatenate([self.is_house, self.is_house[partner]]),
         )
 
     def with_parts(self, parts: Parts) -> _Cast:
         """Parts as objects of their parents' class."""
-        whole = np.where(parts.parent >= 0, parts.parent, np.arange(len(parts.parent)))
+        whole = np.arange(len(parts.parent))
+        for _ in range(2):  # a part of a house, that of a row
+            whole = np.where(parts.parent[whole] >= 0, parts.parent[whole], whole)
         surfaces = self.surfaces.join(parts.owner, Surface.owned_by)
-        return _Cast(surfaces, self.object_class[whole], parts.parent, self.is_apart[whole])
+        return _Cast(surfaces, self.object_class[whole], parts.parent, self.is_apart[whole], parts.is_house)
 
     def settled(self, voxels: Voxels) -> _Cast:
         """Objects numbered by place, none without a voxel of its own.
@@ -187,6 +198,7 @@ class _Cast:
             self.object_class[kept],
             np.asarray(number[self.parent[kept]], dtype=np.int32),
             self.is_apart[kept],
+            self.is_house[kept],
         )
 
 
@@ -264,7 +276,8 @@ def _verdict(
 ) -> Verdict:
     """Label of one object; ``is_apart``: it was matched, but the pair turned out to be two objects."""
     if not (cue.is_before and cue.is_after):
-        return _unmatched(cue, is_apart, params, observability)
+        verdict = _unmatched(cue, is_apart, params, observability)
+        return _extension(cue, verdict, params) if is_part and cue.object_class == ObjectClass.BUILDING else verdict
     if observability.is_enabled and cue.observability < observability.min_observability:
         return Verdict(
             ChangeLabel.UNDETERMINED,
@@ -287,6 +300,27 @@ def _new_part(cue: Cue, params: ChangeParams) -> Verdict | None:
         (ChangeLabel.ADDED, "before") if cue.volume_after > cue.volume_before else (ChangeLabel.REMOVED, "after")
     )
     return Verdict(label, f"{large:.0f} m3 of building in a row, of which the {other} survey shows {small:.0f} m3")
+
+
+def _extension(cue: Cue, verdict: Verdict, params: ChangeParams) -> Verdict:
+    """A part that one survey lacks altogether, smaller than a building, is a change of the building."""
+    label = {ChangeLabel.ADDED: ChangeLabel.INCREASED, ChangeLabel.REMOVED: ChangeLabel.DECREASED}.get(verdict.label)
+    if label is None or params.frontage_m == 0 or max(cue.volume_before, cue.volume_after) >= params.part_is_new_m3:
+        return verdict
+    return Verdict(label, f"a piece of the building: {verdict.reason}")
+
+
+def _changed_houses(
+    verdicts: list[Verdict], parent: IntArray, is_of_house: BoolArray, dv: FloatArray
+) -> dict[int, int]:
+    """Houses that are Unchanged but for a part, and the part that changed most of each."""
+    found: dict[int, int] = {}
+    for part in np.lexsort((np.arange(len(parent)), np.abs(dv))).tolist():
+        house = int(parent[part])
+        is_changed = verdicts[part].label in (ChangeLabel.INCREASED, ChangeLabel.DECREASED)
+        if is_of_house[part] and is_changed and verdicts[house].label == ChangeLabel.UNCHANGED:
+            found[house] = part
+    return found
 
 
 _NEXT_TO_NOTHING = 0.2

@@ -24,6 +24,9 @@ _LINK_VOXELS = 2.9
 _MOST_OF = 0.5
 """A region that takes more than this share of an object's columns is no part of it: the object itself changed."""
 
+_MOST_OF_ROW = 0.75
+"""The same for a row of houses: two of three may have a new storey."""
+
 
 @dataclass(frozen=True)
 class Parts:
@@ -35,47 +38,60 @@ class Parts:
         Object of each point, -1 none; parts are numbered from the old number of objects on.
     parent : (n,) int32
         Object that each object is a part of, -1 none.
+    is_house : (n,) bool
+        Houses that are the unit of change: what changes of them, changes them.
     """
 
     owner: Pair[IntArray]
     parent: IntArray
+    is_house: BoolArray
 
 
 class _Region(NamedTuple):
+    """Connected voxels of one object: their columns, and the share of these that the other epoch's object lacks."""
+
     parent: int
     columns: Int64Array
     n_voxels: int
+    share_new: float
 
 
-def split_parts(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -> Parts:
-    """Take what changed out of long objects, and what did not out of objects that only one epoch has.
+def split_parts(
+    cells: Cells, surfaces: Pair[Surface], is_building: BoolArray, n: int, params: ChangeParams
+) -> Parts:
+    """Take what changed out of long objects and houses, and what did not out of objects that only one epoch has.
 
     A terrace is one object, but one of its houses may have a new storey: a connected region of gained, or of lost,
     voxels becomes a part, with all that stands in the columns under its outline. And where a new house was built
     against a shed, the two are one new object: the region that the other epoch shows too becomes a part.
 
-    Objects shorter than ``part_of_length_m`` that both epochs have stay whole, and so does an object of which a
-    region takes most columns.
+    Other objects shorter than ``part_of_length_m`` that both epochs have stay whole, and so does an object of which a
+    region takes most columns, unless that is a new house.
+
+    A building (``is_building``, (n,) bool) up to that length is one house. What changed of a longer one is part of a
+    house in a row: ``frontage_m`` of the row about it are taken out too, as the house that it is a part of.
     """
     owner = surfaces.map(lambda surface: surface.owner)
-    nobody = np.full(n, -1, dtype=np.int32)
+    nobody, nothing = np.full(n, -1, dtype=np.int32), np.zeros(n, np.bool_)
     if n == 0 or len(cells.voxels) == 0:
-        return Parts(owner, nobody)
+        return Parts(owner, nobody, nothing)
     is_present = owner.map(lambda side: np.isin(np.arange(n), side))
     is_pair = is_present.before & is_present.after
     xyz = np.concatenate([surface.xyz for surface in surfaces])
     size = upright_boxes(xyz, np.concatenate(list(owner)), n).size
-    is_long = is_pair & (np.fmax(size[:, 0], size[:, 1]) > params.part_of_length_m)
+    is_long = np.fmax(size[:, 0], size[:, 1]) > params.part_of_length_m
+    has_houses = is_building & (params.frontage_m > 0)
+    is_split = is_pair & (is_long | has_houses)
     own = cells.owner
     regions = [
-        *_regions(cells, own.before, cells.is_lost, is_long, params),
-        *_regions(cells, own.after, cells.is_gained, is_long, params),
-        *_regions(cells, own.before, cells.is_near.after, ~is_pair, params),
-        *_regions(cells, own.after, cells.is_near.before, ~is_pair, params),
+        *_regions(cells, own, cells.is_lost, is_split, params),
+        *_regions(cells, own.swapped, cells.is_gained, is_split, params),
+        *_regions(cells, own, cells.is_near.after, ~is_pair, params),
+        *_regions(cells, own.swapped, cells.is_near.before, ~is_pair, params),
     ]
-    columns, part, parent = _claim(regions, _columns_of(cells, n), fills_hull=not params.fills_buildings)
+    columns, part, parent, is_house = _claim(regions, _columns_of(cells, n), has_houses & is_pair, is_long, params)
     if len(parent) == 0:
-        return Parts(owner, nobody)
+        return Parts(owner, nobody, nothing)
     lattice = Lattice.around(columns)
     keys = lattice.keys(columns)
     order = np.argsort(keys)
@@ -86,7 +102,9 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangePar
         found = lattice.find(keys, row)
         return np.where(found >= 0, n + part[np.maximum(found, 0)], surface.owner).astype(np.int32)
 
-    return Parts(surfaces.map(taken), np.concatenate([nobody, parent]))
+    is_house = np.concatenate([has_houses & is_pair & ~is_long, is_house])
+    parent = np.where(parent < 0, n - 1 - parent, parent)  # a part of another part
+    return Parts(surfaces.map(taken), np.concatenate([nobody, parent]).astype(np.int32), is_house)
 
 
 def dissolve(owner: Pair[IntArray], is_dissolved: BoolArray, n: int) -> tuple[Pair[IntArray], IntArray]:
@@ -109,23 +127,34 @@ def _columns_of(cells: Cells, n: int) -> tuple[Int64Array, Int64Array]:
 
 
 def _regions(
-    cells: Cells, owner: IntArray, is_in: BoolArray, is_split: BoolArray, params: ChangeParams
+    cells: Cells, owner: Pair[IntArray], is_in: BoolArray, is_split: BoolArray, params: ChangeParams
 ) -> list[_Region]:
-    """Connected regions of the marked voxels within one object."""
-    members = np.flatnonzero(is_in & (owner >= 0) & is_split[np.maximum(owner, 0)])
+    """Connected regions of the marked voxels within one object; ``owner`` of this epoch and of the other."""
+    members = np.flatnonzero(is_in & (owner.before >= 0) & is_split[np.maximum(owner.before, 0)])
     if len(members) == 0:
         return []
     # one tree for all objects: a fourth coordinate keeps them apart
-    place = np.column_stack([cells.voxels.cell[members], owner[members].astype(np.int64) * 10])
+    own = owner.before[members]
+    place = np.column_stack([cells.voxels.cell[members], own.astype(np.int64) * 10])
     links = cKDTree(place).query_pairs(_LINK_VOXELS, output_type="ndarray")
     region = components(links, len(members))
     groups = Groups(region, int(region.max()) + 1)
+    is_shared = _in_column_of(cells, own, members, owner.after)
     found = []
     for index in np.flatnonzero(groups.counts >= params.part_min_voxels).tolist():
-        inside = members[groups.members(index)]
-        plan = unique_rows(cells.voxels.cell[inside, :2])
-        found.append(_Region(int(owner[inside[0]]), plan, len(inside)))
+        inside = groups.members(index)
+        plan, first = np.unique(cells.voxels.cell[members[inside], :2], axis=0, return_index=True)
+        share_new = 1.0 - float(is_shared[inside[first]].mean())
+        found.append(_Region(int(own[inside[0]]), plan, len(inside), share_new))
     return found
+
+
+def _in_column_of(cells: Cells, owner: IntArray, voxel: Int64Array, other: IntArray) -> BoolArray:
+    """Whether each ``owner`` (k,) has a voxel among the ``other`` (c,) owners in the column of its ``voxel`` (k,)."""
+    column = np.repeat(np.arange(len(cells.voxels.columns) - 1), np.diff(cells.voxels.columns))
+    n = int(max(owner.max(initial=-1), other.max(initial=-1))) + 1
+    is_held = other >= 0
+    return np.isin(column[voxel] * n + owner, np.unique(column[is_held] * n + other[is_held]))
 
 
 def _under(region: Int64Array, columns: Int64Array, *, fills_hull: bool) -> BoolArray:
@@ -138,20 +167,57 @@ def _under(region: Int64Array, columns: Int64Array, *, fills_hull: bool) -> Bool
 
 
 def _claim(
-    regions: list[_Region], columns_of: tuple[Int64Array, Int64Array], *, fills_hull: bool
-) -> tuple[Int64Array, Int64Array, IntArray]:
-    """Columns (k, 3) that parts take, the part of each, and the parent of each part; the largest region comes first."""
+    regions: list[_Region],
+    columns_of: tuple[Int64Array, Int64Array],
+    has_houses: BoolArray,
+    is_long: BoolArray,
+    params: ChangeParams,
+) -> tuple[Int64Array, Int64Array, IntArray, BoolArray]:
+    """Columns (k, 3) that parts take, the part of each, and for each part its parent and whether it is a house.
+
+    The largest region comes first. The parent of a part in a house that is a part itself, number p, is ``-1 - p``.
+    """
     rows, start = columns_of
     part_of = np.full(len(rows), -1, dtype=np.int64)
     parents: list[int] = []
+    in_rows: list[tuple[int, _Region]] = []
     for region in sorted(regions, key=lambda r: (-r.n_voxels, r.parent, r.columns[0].tolist())):
         first, last = start[region.parent], start[region.parent + 1]
-        is_inside = _under(region.columns, rows[first:last, 1:], fills_hull=fills_hull)
-        if np.count_nonzero(is_inside) > _MOST_OF * (last - first):
+        is_inside = _under(region.columns, rows[first:last, 1:], fills_hull=not params.fills_buildings)
+        is_in_row = has_houses[region.parent] and is_long[region.parent]
+        is_new = has_houses[region.parent] and region.share_new > 0.5
+        is_new = is_new and region.n_voxels * params.voxel_m**3 > params.part_is_new_m3
+        most_of = 1.0 if is_new else _MOST_OF_ROW if is_in_row else _MOST_OF
+        if np.count_nonzero(is_inside) > most_of * (last - first):
             continue
         is_free = is_inside & (part_of[first:last] < 0)
         if is_free.any():
+            if is_in_row and not is_new:
+                in_rows.append((len(parents), region))
             part_of[first:last][is_free] = len(parents)
             parents.append(region.parent)
+    is_house = [False] * len(parents)
+    for part, region in in_rows:
+        first, last = start[region.parent], start[region.parent + 1]
+        is_free = _house_about(region.columns, rows[first:last, 1:], params) & (part_of[first:last] < 0)
+        if is_free.any():
+            parents[part] = -1 - len(parents)
+            part_of[first:last][is_free] = len(parents)
+            parents.append(region.parent)
+            is_house.append(True)
     is_claimed = part_of >= 0
-    return rows[is_claimed], part_of[is_claimed], np.array(parents, dtype=np.int32)
+    return (
+        rows[is_claimed],
+        part_of[is_claimed],
+        np.array(parents, dtype=np.int32),
+        np.array(is_house, dtype=np.bool_),
+    )
+
+
+def _house_about(region: Int64Array, columns: Int64Array, params: ChangeParams) -> BoolArray:
+    """Which columns (k, 2) of a row of houses are the house that has the region: as far on all sides of it as makes up
+    the frontage of one."""
+    width = float((region.max(axis=0) - region.min(axis=0) + 1).max()) * params.voxel_m
+    reach = max((params.frontage_m - width) / 2, 0.0) / params.voxel_m
+    distance, _ = cKDTree(region).query(columns, distance_upper_bound=reach + 1e-9)
+    return np.asarray(np.isfinite(distance))
