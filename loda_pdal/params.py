@@ -416,6 +416,13 @@ class ChangeParams(StageParams):
     min_support: float = param(
         0.5, "share of an unmatched object's surface in the other survey that makes it Unchanged", low=0, high=1
     )
+    within_share: float = param(
+        0.2,
+        "a plant or other object of which the other survey shows less than this share is another one, and what it shows "
+        "there is a thing in its midst; 0: never",
+        low=0,
+        high=1,
+    )
     backing_voxels: int = param(
         8, "occupancy voxels gained or lost that must back a height or volume cue; 0: none", low=0, high=10000
     )
@@ -731,6 +738,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "vegetation_height_m": 0.8,
             "fills_buildings": True,
             "needs_sight": False,
+            "within_share": 0.0,
             "part_min_voxels": 24,
             "part_is_new_m3": 80.0,
             "frontage_m": 0.0,
@@ -765,6 +773,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "backing_share": 0.0,
             "min_expected_points": 0.0,
             "needs_sight": False,
+            "within_share": 0.0,
             "replaced_m": 0.0,
         },
     },

@@ -86,9 +86,13 @@ def decide_changes(
     cast = _Cast(surfaces, object_class, np.full(n, -1, dtype=np.int32), no, no).settled(voxels)
     cells = cast.cells(voxels, params)
     evidence = weigh(cells, cast.surfaces, len(cast), params)
-    is_no_pair = np.array([_is_no_pair(cue, params) for cue in _rows(evidence, cast.object_class)], dtype=np.bool_)
-    if is_no_pair.any():
-        cast = cast.without_pairs(is_no_pair).settled(voxels)
+    cues = _rows(evidence, cast.object_class)
+    is_within = np.array([_is_within(cue, params) for cue in cues], dtype=np.bool_)
+    is_no_pair = np.array([_is_no_pair(cue, params) for cue in cues], dtype=np.bool_) & ~is_within
+    if is_no_pair.any() or is_within.any():
+        cast = cast.without_pairs(is_no_pair)
+        cast = cast.without_surroundings(is_within, voxels.at_points(cells.is_near.swapped, cast.surfaces))
+        cast = cast.settled(voxels)
         cells = cast.cells(voxels, params)
     if params.find_parts:
         is_building = cast.object_class == ObjectClass.BUILDING
@@ -154,6 +158,21 @@ class _Cast:
             np.concatenate([self.parent, self.parent[partner]]),
             np.concatenate([self.is_apart | is_no_pair, np.ones(len(partner), np.bool_)]),
             np.concatenate([self.is_house, self.is_house[partner]]),
+        )
+
+    def without_surroundings(self, is_within: BoolArray, is_shared: Pair[BoolArray]) -> _Cast:
+        """Of the marked objects (k,) keep what both epochs show; the rest is an object of its own."""
+        number = np.full(len(self) + 1, -1, dtype=np.int32)
+        inner = np.flatnonzero(is_within)
+        number[inner] = len(self) + np.arange(len(inner), dtype=np.int32)
+        owner = self.surfaces.join(
+            is_shared,
+            lambda side, shared: np.where(~shared & (number[side.owner] >= 0), number[side.owner], side.owner),
+        )
+        return _Cast(
+            self.surfaces.join(owner, Surface.owned_by),
+            *(np.concatenate([values, values[inner]]) for values in (self.object_class, self.parent, self.is_apart)),
+            np.concatenate([self.is_house, self.is_house[inner]]),
         )
 
     def with_parts(self, parts: Parts) -> _Cast:
@@ -252,6 +271,14 @@ def _rows(evidence: Evidence, object_class: ByteArray) -> list[Cue]:
     ]
 
 
+def _is_within(cue: Cue, params: ChangeParams) -> bool:
+    """Whether what one epoch shows stands in the midst of what the other shows: a lamp post where a tree was planted."""
+    supports = cue.support_before, cue.support_after
+    is_plain = cue.object_class in (ObjectClass.VEGETATION, ObjectClass.OTHER)
+    is_pair = cue.is_before and cue.is_after
+    return params.within_share > 0 and is_plain and is_pair and min(supports) < params.within_share <= max(supports)
+
+
 def _is_no_pair(cue: Cue, params: ChangeParams) -> bool:
     """A matched building or tree whose overlap or shift is beyond the paper's bounds is two objects."""
     if not (cue.is_before and cue.is_after):
@@ -260,10 +287,14 @@ def _is_no_pair(cue: Cue, params: ChangeParams) -> bool:
         return cue.iou <= params.building_iou or (cue.shift >= params.building_shift_m and _is_apart(cue, params))
     if cue.object_class == ObjectClass.VEGETATION:
         return cue.iou <= params.vegetation_iou or (cue.shift >= params.vegetation_shift_m and _is_apart(cue, params))
-    if cue.object_class == ObjectClass.MOBILE and params.replaced_m > 0:
+    if cue.object_class == ObjectClass.MOBILE and params.replaced_m > 0 and cue.n_voxels >= _LEAST_VEHICLE:
         is_elsewhere = cue.d_typical > params.replaced_m / 2 or min(cue.support_before, cue.support_after) < 0.8
         return abs(cue.dh) > params.replaced_m and is_elsewhere
     return False
+
+
+_LEAST_VEHICLE = 40
+"""Voxels of a vehicle: what is smaller is a bin or a bicycle, and shows other sides of itself every time."""
 
 
 def _is_apart(cue: Cue, params: ChangeParams) -> bool:
@@ -376,8 +407,8 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
     least_above = max(least, params.backing_share * cue.n_voxels)
     has_height = params.use_height and abs(cue.dh) > max(gate, height_m)  # NaN is never above
     has_volume = params.use_volume and abs(cue.dv_ratio) > ratio
-    is_raised = least == 0 or cue.gained_above >= least_above or cue.column_rise > height_m / 2
-    is_lowered = least == 0 or cue.lost_above >= least_above or cue.column_rise < -height_m / 2
+    is_raised = least == 0 or cue.gained_above >= least_above or cue.column_rise > max(gate, height_m) / 2
+    is_lowered = least == 0 or cue.lost_above >= least_above or cue.column_rise < -max(gate, height_m) / 2
     rises = has_height and cue.dh > 0 and is_raised
     sinks = has_height and cue.dh < 0 and is_lowered
     noise = params.volume_sigmas * math.sqrt(cue.gained + cue.lost)

@@ -202,7 +202,7 @@ def _stands_apart(left: IntArray, votes: Pair[_Votes], kinds: Pair[ByteArray]) -
     not those that occupy each other's space: they are one thing with two names.
     """
     host = votes.before.partner[left]
-    is_mutual = votes.after.partner[host] == left
+    is_mutual = (votes.after.partner[host] == left) & (votes.after.support[host] >= _MIN_SHARED)
     kind, of_host = kinds.before[left], kinds.after[host]
     is_same = (kind == of_host) & np.isin(kind, (ObjectClass.BUILDING, ObjectClass.VEGETATION))
     return np.asarray(~is_same & ~is_mutual)

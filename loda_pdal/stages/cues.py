@@ -123,9 +123,17 @@ class Voxels:
 
     def on_points(self, holder: IntArray, surfaces: Pair[Surface]) -> Pair[IntArray]:
         """The object that has the voxel of each point of either epoch, -1 for points without object."""
+        return self._spread(holder, surfaces, np.int32(-1))
+
+    def at_points(self, values: Pair[BoolArray], surfaces: Pair[Surface]) -> Pair[BoolArray]:
+        """What is true (c,) of the voxel of each point of either epoch; false for points without object."""
+        return self._spread(np.column_stack(list(values)), surfaces, np.bool_(False))
+
+    def _spread(self, values: npt.NDArray[Any], surfaces: Pair[Surface], none: Any) -> Pair[npt.NDArray[Any]]:
+        """Values (c, 2) of the slots on the points of either epoch, ``none`` on points without object."""
         n_before = len(surfaces.before.owner)
-        spread = np.full(n_before + len(surfaces.after.owner), -1, dtype=np.int32)
-        spread[self.point] = np.repeat(holder.ravel(), np.diff(self.starts))
+        spread = np.full(n_before + len(surfaces.after.owner), none)
+        spread[self.point] = np.repeat(values.ravel(), np.diff(self.starts))
         return Pair(spread[:n_before], spread[n_before:])
 
 
@@ -398,7 +406,7 @@ def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -
         d_typical=np.where(is_sampled, samples.median(np.abs(displacement)), np.nan),
         gained_above=_count(own.after, cells.is_gained & _is_above(z, own.after, summit.before), n),
         lost_above=_count(own.before, cells.is_lost & _is_above(z, own.before, summit.after), n),
-        column_rise=_column_rise(columns, n),
+        column_rise=_column_rise(voxels, surfaces, n),
         lod95=Groups(owner, n).median(voxels.lod95[voxel]),
         observability=(n_known.before + n_known.after) / np.maximum(n_voxels.before + n_voxels.after, 1),
         rise=_rise(cells, n),
@@ -482,12 +490,31 @@ def _summit(owner: IntArray, top: FloatArray, n: int) -> FloatArray:
     return Groups(owner[is_known], n).quantile(top[is_known], 0.95)
 
 
-def _column_rise(columns: _Columns, n: int) -> FloatArray:
-    """Median change of the columns' tops (n,) m over the columns that both epochs have."""
-    rise = columns.top.after - columns.top.before
-    is_both = np.isfinite(rise)
-    groups = Groups(columns.owner[is_both], n)
-    return np.where(groups.counts >= _LEAST_COLUMNS, groups.median(rise[is_both]), np.nan)
+def _column_rise(voxels: Voxels, surfaces: Pair[Surface], n: int) -> FloatArray:
+    """Median change of the columns' tops (n,) m over the columns that both epochs have.
+
+    The more points, the higher the highest of them: where an epoch has m points of the object in a column and the other
+    k < m, its top is that of k points drawn from the m, which lies at rank (m + 1) / (k + 1) in the mean.
+    """
+    owner = voxels.of_points([side.owner for side in surfaces])
+    kept = np.flatnonzero((owner >= 0) & voxels.is_open)
+    slot = np.repeat(np.arange(2 * len(voxels)), np.diff(voxels.starts))[kept]
+    column = np.repeat(np.arange(len(voxels.columns) - 1), np.diff(voxels.columns))[slot >> 1]
+    z = voxels.of_points([side.xyz[:, 2] for side in surfaces])[kept]
+    key = (column * n + owner[kept]) * 2 + (slot & 1)
+    order = np.lexsort((-z, key))
+    key, z = key[order], z[order]
+    first = np.flatnonzero(np.diff(key, prepend=-1))
+    count = np.diff(first, append=len(key))
+    before = np.flatnonzero((key[first[:-1]] % 2 == 0) & (key[first[1:]] == key[first[:-1]] + 1))
+    tops = []
+    for own, other in ((before, before + 1), (before + 1, before)):
+        rank = np.maximum((count[own] + 1) / (np.minimum(count[own], count[other]) + 1), 1.0) - 1.0
+        low = np.minimum(rank.astype(np.int64), count[own] - 1)
+        high = np.minimum(low + 1, count[own] - 1)
+        tops.append(z[first[own] + low] + (rank - low) * (z[first[own] + high] - z[first[own] + low]))
+    groups = Groups(((key[first[before]] // 2) % max(n, 1)).astype(np.int32), n)
+    return np.where(groups.counts >= _LEAST_COLUMNS, groups.median(tops[1] - tops[0]), np.nan)
 
 
 _LEAST_COLUMNS = 8

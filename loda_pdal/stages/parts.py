@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -215,9 +216,14 @@ def _claim(
 
 
 def _house_about(region: Int64Array, columns: Int64Array, params: ChangeParams) -> BoolArray:
-    """Which columns (k, 2) of a row of houses are the house that has the region: as far on all sides of it as makes up
-    the frontage of one."""
-    width = float((region.max(axis=0) - region.min(axis=0) + 1).max()) * params.voxel_m
-    reach = max((params.frontage_m - width) / 2, 0.0) / params.voxel_m
-    distance, _ = cKDTree(region).query(columns, distance_upper_bound=reach + 1e-9)
-    return np.asarray(np.isfinite(distance))
+    """Which columns (k, 2) of a row of houses are the house that has the region: one frontage of the row, all through."""
+    near, reach = params.frontage_m / params.voxel_m, params.part_of_length_m / params.voxel_m
+    middle = (region.min(axis=0) + region.max(axis=0)) / 2
+    offset = columns - middle
+    x, y = offset[np.hypot(offset[:, 0], offset[:, 1]) <= near].T
+    if len(x) == 0:
+        return np.zeros(len(columns), np.bool_)
+    angle = 0.5 * math.atan2(2 * float(np.mean(x * y) - x.mean() * y.mean()), float(np.var(x) - np.var(y)))
+    along, across = np.array([math.cos(angle), math.sin(angle)]), np.array([-math.sin(angle), math.cos(angle)])
+    half = max(near / 2, float(np.abs((region - middle) @ along).max()))
+    return np.asarray((np.abs(offset @ along) <= half) & (np.abs(offset @ across) <= reach))
