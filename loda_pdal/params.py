@@ -113,11 +113,12 @@ class OutlierParams(StageParams):
     k: int = param(20, "neighbours whose mean distance is judged", symbol="k", low=1, high=200)
     std_multiplier: float = param(3.0, "standard deviations above the mean that make an outlier", low=0.1, high=20)
     keep_voxels: int = param(
-        8, "outliers that hang together in clusters of this many are thin or far away and stay; 0: none", low=0, high=10000
+        8,
+        "outliers that hang together in clusters of this many are thin or far away and stay; 0: none",
+        low=0,
+        high=10000,
     )
-    keep_gap_m: float = param(
-        0.6, "largest gap within such a cluster", unit="m", low=0.05, high=20, is_length=True
-    )
+    keep_gap_m: float = param(0.6, "largest gap within such a cluster", unit="m", low=0.05, high=20, is_length=True)
 
 
 @dataclass(frozen=True)
@@ -444,8 +445,8 @@ class ChangeParams(StageParams):
         0.0, "gained less lost voxels must exceed this many times the root of their sum; 0: need not", low=0, high=100
     )
     replaced_m: float = param(
-        0.15,
-        "difference of the tops that makes a parked vehicle another one, where its surface moved by half of that; "
+        0.06,
+        "how far a quarter of a parked vehicle's surface must be off, after the best move, to make it another one; "
         "0: never",
         unit="m",
         low=0,

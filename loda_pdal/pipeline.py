@@ -257,6 +257,7 @@ def label_objects(
     p: Parameters,
 ) -> Changes:
     """Cues and change labels (section 4.3)."""
+
     def surface(cloud: VoxelCloud, g: Ground, s: Segments, i: Instances, own: IntArray) -> Surface:
         is_surface = i.classification != ObjectClass.GROUND
         return Surface(cloud.xyz, s.features.normals, g.height, cloud.n_raw, own, is_surface)

@@ -22,6 +22,7 @@ from loda_pdal.stages.correspondence import rank_by_place
 from loda_pdal.stages.cues import Cells, Evidence, Surface, Voxels, cells_with_owners, sample_voxels, weigh
 from loda_pdal.stages.observability import Coverage
 from loda_pdal.stages.parts import Parts, dissolve, split_parts
+from loda_pdal.stages.vehicles import shape_change
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,7 @@ def decide_changes(
     cues = _rows(evidence, cast.object_class)
     is_within = np.array([_is_within(cue, params) for cue in cues], dtype=np.bool_)
     is_no_pair = np.array([_is_no_pair(cue, params) for cue in cues], dtype=np.bool_) & ~is_within
+    is_no_pair |= _is_replaced(cast, cues, voxels.at_points(cells.is_seen.swapped, cast.surfaces), params)
     if is_no_pair.any() or is_within.any():
         cast = cast.without_pairs(is_no_pair)
         cast = cast.without_surroundings(is_within, voxels.at_points(cells.is_near.swapped, cast.surfaces))
@@ -171,7 +173,9 @@ class _Cast:
         )
         return _Cast(
             self.surfaces.join(owner, Surface.owned_by),
-            *(np.concatenate([values, values[inner]]) for values in (self.object_class, self.parent, self.is_apart)),
+            np.concatenate([self.object_class, self.object_class[inner]]),
+            np.concatenate([self.parent, self.parent[inner]]),
+            np.concatenate([self.is_apart, self.is_apart[inner]]),
             np.concatenate([self.is_house, self.is_house[inner]]),
         )
 
@@ -287,10 +291,23 @@ def _is_no_pair(cue: Cue, params: ChangeParams) -> bool:
         return cue.iou <= params.building_iou or (cue.shift >= params.building_shift_m and _is_apart(cue, params))
     if cue.object_class == ObjectClass.VEGETATION:
         return cue.iou <= params.vegetation_iou or (cue.shift >= params.vegetation_shift_m and _is_apart(cue, params))
-    if cue.object_class == ObjectClass.MOBILE and params.replaced_m > 0 and cue.n_voxels >= _LEAST_VEHICLE:
-        is_elsewhere = cue.d_typical > params.replaced_m / 2 or min(cue.support_before, cue.support_after) < 0.8
-        return abs(cue.dh) > params.replaced_m and is_elsewhere
     return False
+
+
+def _is_replaced(cast: _Cast, cues: list[Cue], is_open: Pair[BoolArray], params: ChangeParams) -> BoolArray:
+    """Which vehicles stand where another one stood."""
+    is_asked = np.array(
+        [
+            params.replaced_m > 0
+            and cue.object_class == ObjectClass.MOBILE
+            and cue.is_before
+            and cue.is_after
+            and cue.n_voxels >= _LEAST_VEHICLE
+            for cue in cues
+        ],
+        dtype=np.bool_,
+    )
+    return np.asarray(shape_change(cast.surfaces, is_open, is_asked) > params.replaced_m)
 
 
 _LEAST_VEHICLE = 40
@@ -317,8 +334,8 @@ def _verdict(
         )
     if cue.object_class == ObjectClass.MOBILE:
         return _mobile(cue, params)
-    if is_part and cue.object_class == ObjectClass.BUILDING and (verdict := _new_part(cue, params)):
-        return verdict
+    if is_part and cue.object_class == ObjectClass.BUILDING and (new := _new_part(cue, params)):
+        return new
     return _pair(cue, params)
 
 

@@ -289,9 +289,7 @@ def cells_with_owners(
     return Cells(voxels, owner, is_seen)
 
 
-def _is_over(
-    centre: FloatArray, cell: Int64Array, columns: Int64Array, xyz: FloatArray, voxel_m: float
-) -> BoolArray:
+def _is_over(centre: FloatArray, cell: Int64Array, columns: Int64Array, xyz: FloatArray, voxel_m: float) -> BoolArray:
     """Whether any of the points (m, 3) lies in the column of each voxel (c,), beneath its centre."""
     first = columns[:-1]
     if len(first) == 0 or len(xyz) == 0:

@@ -57,9 +57,7 @@ class _Region(NamedTuple):
     share_new: float
 
 
-def split_parts(
-    cells: Cells, surfaces: Pair[Surface], is_building: BoolArray, n: int, params: ChangeParams
-) -> Parts:
+def split_parts(cells: Cells, surfaces: Pair[Surface], is_building: BoolArray, n: int, params: ChangeParams) -> Parts:
     """Take what changed out of long objects and houses, and what did not out of objects that only one epoch has.
 
     A terrace is one object, but one of its houses may have a new storey: a connected region of gained, or of lost,

@@ -1,0 +1,131 @@
+"""Is it the same vehicle: shapes compared after a small move (beyond the paper, which asks for overlap alone).
+
+Another vehicle in the same slot overlaps with the one that left, and may be as high; the same one may have been parked
+again, half a metre on. So each is moved in plan until it fits, and what then still lies apart is another shape.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from loda_pdal.kernels.neighbours import nearest
+from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array
+from loda_pdal.model.groups import Groups
+from loda_pdal.model.pair import Pair
+from loda_pdal.stages.cues import Surface
+
+_ITERATIONS = 10
+_REACH_M = 0.6
+"""Surfaces farther apart do not pull at each other while a vehicle is moved."""
+
+_SOFT_M = 0.05
+"""Residual at which a pair of points pulls half as much as a perfect one."""
+
+_LONGEST_M = 0.8
+"""A vehicle is moved no farther."""
+
+_NEAR_M = 0.35
+"""Surfaces this close are the same surface: seen by both."""
+
+_FAR_M = 1.0
+"""Residual of points with nothing closer."""
+
+_MIN_POINTS = 30
+_APART_M = 100.0
+"""Vehicles are lifted so far from each other that none sees another: one search serves them all."""
+
+
+def shape_change(surfaces: Pair[Surface], is_open: Pair[BoolArray], is_asked: BoolArray) -> FloatArray:
+    """How far the shapes of objects differ between the epochs, (n,) m; NaN where not asked for or too few points.
+
+    The upper quartile of the point-to-plane residuals of one epoch's points on the other's surface after the best move,
+    from the epoch that fits better: what only one epoch shows of a vehicle does not count against it.
+
+    Parameters
+    ----------
+    surfaces : Pair of Surface
+        Points with their objects.
+    is_open : Pair of (m,) bool
+        Whether the other epoch could see where the point is.
+    is_asked : (n,) bool
+        Objects that are compared, present in both epochs.
+    """
+    if not is_asked.any():
+        return np.full(len(is_asked), np.nan)
+    lift = np.where(is_asked, np.cumsum(is_asked), -1)
+    members = surfaces.map(lambda side: np.flatnonzero(np.append(is_asked, False)[side.owner]))
+    apart = surfaces.join(members, lambda side, idx: _lifted(side, idx, lift))
+    before = _residual(
+        surfaces.before,
+        members.before,
+        apart.before,
+        is_open.before,
+        surfaces.after,
+        members.after,
+        apart.after,
+        len(is_asked),
+    )
+    after = _residual(
+        surfaces.after,
+        members.after,
+        apart.after,
+        is_open.after,
+        surfaces.before,
+        members.before,
+        apart.before,
+        len(is_asked),
+    )
+    return np.fmin(before, after)
+
+
+def _lifted(surface: Surface, members: Int64Array, lift: Int64Array) -> FloatArray:
+    """Points (k, 3) m of the members, each object at a height of its own."""
+    xyz = surface.xyz[members].copy()
+    xyz[:, 2] += _APART_M * lift[surface.owner[members]]
+    return xyz
+
+
+def _residual(
+    surface: Surface,
+    members: Int64Array,
+    xyz: FloatArray,
+    is_open: BoolArray,
+    other: Surface,
+    other_members: Int64Array,
+    other_xyz: FloatArray,
+    n: int,
+) -> FloatArray:
+    """Upper quartile (n,) m of the residuals of one epoch's points (k, 3) on the other's (l, 3)."""
+    owner = surface.owner[members]
+    normals = other.normals[other_members].astype(np.float64)
+    groups = Groups(owner, n)
+    move = np.zeros((n, 2))
+    for _ in range(_ITERATIONS):
+        move = _moved_on(xyz + np.column_stack([move[owner], np.zeros(len(owner))]), other_xyz, normals, groups, move)
+    moved = xyz + np.column_stack([move[owner], np.zeros(len(owner))])
+    found, distance = nearest(other_xyz, moved, _FAR_M)
+    normal = normals[found]
+    across = np.abs(np.sum(normal * (other_xyz[found] - moved), axis=1))
+    residual = np.where(np.any(normal != 0, axis=1), across, distance)
+    residual = np.where(found >= 0, residual, _FAR_M)
+    residual[~(is_open[members] | (distance <= _NEAR_M))] = np.nan
+    counted = Groups(np.where(np.isfinite(residual), owner, -1), n)
+    return np.where(counted.counts >= _MIN_POINTS, groups.quantile(residual, 0.75), np.nan)
+
+
+def _moved_on(
+    moved: FloatArray, other_xyz: FloatArray, normals: FloatArray, groups: Groups, move: FloatArray
+) -> FloatArray:
+    """The moves (n, 2) m after one robust Gauss-Newton step in plan."""
+    found, _ = nearest(other_xyz, moved, _REACH_M)
+    normal = np.where(found[:, None] >= 0, normals[found], 0.0)
+    residual = np.sum(normal * (other_xyz[found] - moved), axis=1)
+    weight = 1.0 / (1.0 + (residual / _SOFT_M) ** 2)
+    x, y = normal[:, 0], normal[:, 1]
+    xx, xy, yy, rx, ry = groups.sum(
+        weight[:, None] * np.column_stack([x * x, x * y, y * y, x * residual, y * residual])
+    ).T
+    stiff = 0.01 * groups.counts + 1e-9  # a side seen alone says nothing about the other direction
+    xx, yy = xx + stiff, yy + stiff
+    step = np.column_stack([yy * rx - xy * ry, xx * ry - xy * rx]) / (xx * yy - xy * xy)[:, None]
+    return np.clip(move + step, -_LONGEST_M, _LONGEST_M)
