@@ -1,7 +1,7 @@
 """Is it the same vehicle: shapes compared after a small move (beyond the paper, which asks for overlap alone).
 
 Another vehicle in the same slot overlaps with the one that left, and may be as high; the same one may have been parked
-again, half a metre on. So each is moved in plan until it fits, and what then still lies apart is another shape.
+again, half a metre on. So each is moved and turned until it fits, and what then still lies apart is another shape.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ _REACH_M = 0.6
 _SOFT_M = 0.05
 """Residual at which a pair of points pulls half as much as a perfect one."""
 
-_LONGEST_M = 0.8
-"""A vehicle is moved no farther."""
+_MOST = np.array([0.8, 0.8, 0.1, 0.1])
+"""A vehicle is moved no farther along x, y and z (m), and turned no more about its middle (rad)."""
 
 _NEAR_M = 0.35
 """Surfaces this close are the same surface: seen by both."""
@@ -99,10 +99,12 @@ def _residual(
     owner = surface.owner[members]
     normals = other.normals[other_members].astype(np.float64)
     groups = Groups(owner, n)
-    move = np.zeros((n, 2))
+    arm = xyz[:, :2] - groups.mean(xyz[:, :2])[owner]
+    arm = np.column_stack([-arm[:, 1], arm[:, 0]])  # where a turn takes the points
+    move = np.zeros((n, 4))
     for _ in range(_ITERATIONS):
-        move = _moved_on(xyz + np.column_stack([move[owner], np.zeros(len(owner))]), other_xyz, normals, groups, move)
-    moved = xyz + np.column_stack([move[owner], np.zeros(len(owner))])
+        move = _moved_on(_at(xyz, arm, move[owner]), arm, other_xyz, normals, groups, move)
+    moved = _at(xyz, arm, move[owner])
     found, distance = nearest(other_xyz, moved, _FAR_M)
     normal = normals[found]
     across = np.abs(np.sum(normal * (other_xyz[found] - moved), axis=1))
@@ -113,19 +115,24 @@ def _residual(
     return np.where(counted.counts >= _MIN_POINTS, groups.quantile(residual, 0.75), np.nan)
 
 
+def _at(xyz: FloatArray, arm: FloatArray, move: FloatArray) -> FloatArray:
+    """Points (k, 3) after their moves (k, 4): x, y, z and a small turn."""
+    moved = xyz + move[:, :3]
+    moved[:, :2] += move[:, 3:] * arm
+    return moved
+
+
 def _moved_on(
-    moved: FloatArray, other_xyz: FloatArray, normals: FloatArray, groups: Groups, move: FloatArray
+    moved: FloatArray, arm: FloatArray, other_xyz: FloatArray, normals: FloatArray, groups: Groups, move: FloatArray
 ) -> FloatArray:
-    """The moves (n, 2) m after one robust Gauss-Newton step in plan."""
+    """The moves (n, 4) after one robust Gauss-Newton step."""
     found, _ = nearest(other_xyz, moved, _REACH_M)
     normal = np.where(found[:, None] >= 0, normals[found], 0.0)
     residual = np.sum(normal * (other_xyz[found] - moved), axis=1)
     weight = 1.0 / (1.0 + (residual / _SOFT_M) ** 2)
-    x, y = normal[:, 0], normal[:, 1]
-    xx, xy, yy, rx, ry = groups.sum(
-        weight[:, None] * np.column_stack([x * x, x * y, y * y, x * residual, y * residual])
-    ).T
-    stiff = 0.01 * groups.counts + 1e-9  # a side seen alone says nothing about the other direction
-    xx, yy = xx + stiff, yy + stiff
-    step = np.column_stack([yy * rx - xy * ry, xx * ry - xy * rx]) / (xx * yy - xy * xy)[:, None]
-    return np.clip(move + step, -_LONGEST_M, _LONGEST_M)
+    slope = np.column_stack([normal, np.sum(normal[:, :2] * arm, axis=1)])
+    pull = groups.sum((weight * residual)[:, None] * slope)
+    stiffness = groups.sum(weight[:, None, None] * slope[:, :, None] * slope[:, None, :])
+    # a side seen alone says nothing about the other directions
+    stiffness += (0.01 * groups.counts + 1e-9)[:, None, None] * np.eye(4)
+    return np.clip(move + np.linalg.solve(stiffness, pull[:, :, None])[:, :, 0], -_MOST, _MOST)
