@@ -445,7 +445,7 @@ class ChangeParams(StageParams):
         0.0, "gained less lost voxels must exceed this many times the root of their sum; 0: need not", low=0, high=100
     )
     replaced_m: float = param(
-        0.06,
+        0.045,
         "how far a quarter of a parked vehicle's surface must be off, after the best move, to make it another one; "
         "0: never",
         unit="m",

@@ -22,7 +22,7 @@ from loda_pdal.stages.correspondence import rank_by_place
 from loda_pdal.stages.cues import Cells, Evidence, Surface, Voxels, cells_with_owners, sample_voxels, weigh
 from loda_pdal.stages.observability import Coverage
 from loda_pdal.stages.parts import Parts, dissolve, split_parts
-from loda_pdal.stages.vehicles import shape_change
+from loda_pdal.stages.vehicles import looks_like_vehicle, shape_change
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def decide_changes(
     voxels = sample_voxels(surfaces, seen, lod, params)
     n = len(object_class)
     no = np.zeros(n, np.bool_)
-    cast = _Cast(surfaces, object_class, np.full(n, -1, dtype=np.int32), no, no).settled(voxels)
+    cast = _Cast(surfaces, object_class, np.full(n, -1, dtype=np.int32), no, no, no).settled(voxels)
     cells = cast.cells(voxels, params)
     evidence = weigh(cells, cast.surfaces, len(cast), params)
     cues = _rows(evidence, cast.object_class)
@@ -102,7 +102,7 @@ def decide_changes(
         cells = cast.cells(voxels, params)
     evidence = weigh(cells, cast.surfaces, len(cast), params)
     surfaces, object_class, parent, is_apart = cast.surfaces, cast.object_class, cast.parent, cast.is_apart
-    carrier = np.append(cast.is_house, False)[parent]
+    carrier = np.append(cast.is_house, False)[parent] & cast.is_extension
     cues = _rows(evidence, object_class)
     verdicts = [
         _verdict(cue, apart, part, params, observability)
@@ -135,13 +135,14 @@ def decide_changes(
 @dataclass(frozen=True)
 class _Cast:
     """The objects as they stand: who owns which point, of which class, part of whom, whether a pair was undone, and
-    whether what changes a part of it changes it."""
+    whether it is a house, which what is built onto it changes, or built onto one."""
 
     surfaces: Pair[Surface]
     object_class: ByteArray
     parent: IntArray
     is_apart: BoolArray
     is_house: BoolArray
+    is_extension: BoolArray
 
     def __len__(self) -> int:
         return len(self.object_class)
@@ -160,6 +161,7 @@ class _Cast:
             np.concatenate([self.parent, self.parent[partner]]),
             np.concatenate([self.is_apart | is_no_pair, np.ones(len(partner), np.bool_)]),
             np.concatenate([self.is_house, self.is_house[partner]]),
+            np.concatenate([self.is_extension, self.is_extension[partner]]),
         )
 
     def without_surroundings(self, is_within: BoolArray, is_shared: Pair[BoolArray]) -> _Cast:
@@ -177,6 +179,7 @@ class _Cast:
             np.concatenate([self.parent, self.parent[inner]]),
             np.concatenate([self.is_apart, self.is_apart[inner]]),
             np.concatenate([self.is_house, self.is_house[inner]]),
+            np.concatenate([self.is_extension, self.is_extension[inner]]),
         )
 
     def with_parts(self, parts: Parts) -> _Cast:
@@ -185,7 +188,14 @@ class _Cast:
         for _ in range(2):  # a part of a house, that of a row
             whole = np.where(parts.parent[whole] >= 0, parts.parent[whole], whole)
         surfaces = self.surfaces.join(parts.owner, Surface.owned_by)
-        return _Cast(surfaces, self.object_class[whole], parts.parent, self.is_apart[whole], parts.is_house)
+        return _Cast(
+            surfaces,
+            self.object_class[whole],
+            parts.parent,
+            self.is_apart[whole],
+            parts.is_house,
+            parts.is_extension,
+        )
 
     def settled(self, voxels: Voxels) -> _Cast:
         """Objects numbered by place, none without a voxel of its own.
@@ -222,6 +232,7 @@ class _Cast:
             np.asarray(number[self.parent[kept]], dtype=np.int32),
             self.is_apart[kept],
             self.is_house[kept],
+            self.is_extension[kept],
         )
 
 
@@ -296,22 +307,10 @@ def _is_no_pair(cue: Cue, params: ChangeParams) -> bool:
 
 def _is_replaced(cast: _Cast, cues: list[Cue], is_open: Pair[BoolArray], params: ChangeParams) -> BoolArray:
     """Which vehicles stand where another one stood."""
-    is_asked = np.array(
-        [
-            params.replaced_m > 0
-            and cue.object_class == ObjectClass.MOBILE
-            and cue.is_before
-            and cue.is_after
-            and cue.n_voxels >= _LEAST_VEHICLE
-            for cue in cues
-        ],
-        dtype=np.bool_,
-    )
+    is_pair = np.array([cue.is_before and cue.is_after for cue in cues], dtype=np.bool_)
+    is_asked = is_pair & (cast.object_class == ObjectClass.MOBILE) & (params.replaced_m > 0)
+    is_asked &= looks_like_vehicle(cast.surfaces, len(cast))
     return np.asarray(shape_change(cast.surfaces, is_open, is_asked) > params.replaced_m)
-
-
-_LEAST_VEHICLE = 40
-"""Voxels of a vehicle: what is smaller is a bin or a bicycle, and shows other sides of itself every time."""
 
 
 def _is_apart(cue: Cue, params: ChangeParams) -> bool:

@@ -25,6 +25,9 @@ _LINK_VOXELS = 2.9
 _MOST_OF = 0.5
 """A region that takes more than this share of an object's columns is no part of it: the object itself changed."""
 
+_WIDE = 0.6
+"""Storeys wider than this many frontages are those of a house of their own."""
+
 _MOST_OF_ROW = 0.75
 """The same for a row of houses: two of three may have a new storey."""
 
@@ -40,12 +43,15 @@ class Parts:
     parent : (n,) int32
         Object that each object is a part of, -1 none.
     is_house : (n,) bool
-        Houses that are the unit of change: what changes of them, changes them.
+        Houses that are the unit of change: what is built onto them changes them.
+    is_extension : (n,) bool
+        Parts that are built onto a house; a storey that is as wide as a house is a change of that house alone.
     """
 
     owner: Pair[IntArray]
     parent: IntArray
     is_house: BoolArray
+    is_extension: BoolArray
 
 
 class _Region(NamedTuple):
@@ -73,7 +79,7 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], is_building: BoolArray, n
     owner = surfaces.map(lambda surface: surface.owner)
     nobody, nothing = np.full(n, -1, dtype=np.int32), np.zeros(n, np.bool_)
     if n == 0 or len(cells.voxels) == 0:
-        return Parts(owner, nobody, nothing)
+        return Parts(owner, nobody, nothing, nothing)
     is_present = owner.map(lambda side: np.isin(np.arange(n), side))
     is_pair = is_present.before & is_present.after
     xyz = np.concatenate([surface.xyz for surface in surfaces])
@@ -88,9 +94,9 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], is_building: BoolArray, n
         *_regions(cells, own, cells.is_near.after, ~is_pair, params),
         *_regions(cells, own.swapped, cells.is_near.before, ~is_pair, params),
     ]
-    columns, part, parent, is_house = _claim(regions, _columns_of(cells, n), has_houses & is_pair, is_long, params)
+    columns, part, parent, is_house, is_extension = _claim(regions, _columns_of(cells, n), has_houses & is_pair, is_long, params)
     if len(parent) == 0:
-        return Parts(owner, nobody, nothing)
+        return Parts(owner, nobody, nothing, nothing)
     lattice = Lattice.around(columns)
     keys = lattice.keys(columns)
     order = np.argsort(keys)
@@ -102,8 +108,9 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], is_building: BoolArray, n
         return np.where(found >= 0, n + part[np.maximum(found, 0)], surface.owner).astype(np.int32)
 
     is_house = np.concatenate([has_houses & is_pair & ~is_long, is_house])
+    is_extension = np.concatenate([nothing, is_extension])
     parent = np.where(parent < 0, n - 1 - parent, parent)  # a part of another part
-    return Parts(surfaces.map(taken), np.concatenate([nobody, parent]).astype(np.int32), is_house)
+    return Parts(surfaces.map(taken), np.concatenate([nobody, parent]).astype(np.int32), is_house, is_extension)
 
 
 def dissolve(owner: Pair[IntArray], is_dissolved: BoolArray, n: int) -> tuple[Pair[IntArray], IntArray]:
@@ -171,14 +178,16 @@ def _claim(
     has_houses: BoolArray,
     is_long: BoolArray,
     params: ChangeParams,
-) -> tuple[Int64Array, Int64Array, IntArray, BoolArray]:
-    """Columns (k, 3) that parts take, the part of each, and for each part its parent and whether it is a house.
+) -> tuple[Int64Array, Int64Array, IntArray, BoolArray, BoolArray]:
+    """Columns (k, 3) that parts take, the part of each, and for each part its parent, whether it is a house, and whether
+    it is built onto one.
 
     The largest region comes first. The parent of a part in a house that is a part itself, number p, is ``-1 - p``.
     """
     rows, start = columns_of
     part_of = np.full(len(rows), -1, dtype=np.int64)
     parents: list[int] = []
+    is_extension: list[bool] = []
     in_rows: list[tuple[int, _Region]] = []
     for region in sorted(regions, key=lambda r: (-r.n_voxels, r.parent, r.columns[0].tolist())):
         first, last = start[region.parent], start[region.parent + 1]
@@ -191,7 +200,10 @@ def _claim(
             continue
         is_free = is_inside & (part_of[first:last] < 0)
         if is_free.any():
-            if is_in_row and not is_new:
+            width_m = float((np.ptp(region.columns, axis=0) + 1).max()) * params.voxel_m
+            is_storey = region.share_new < 0.5 and width_m > _WIDE * params.frontage_m
+            is_extension.append(bool(has_houses[region.parent]) and not is_new and not is_storey)
+            if is_in_row and is_extension[-1]:
                 in_rows.append((len(parents), region))
             part_of[first:last][is_free] = len(parents)
             parents.append(region.parent)
@@ -204,12 +216,14 @@ def _claim(
             part_of[first:last][is_free] = len(parents)
             parents.append(region.parent)
             is_house.append(True)
+            is_extension.append(False)
     is_claimed = part_of >= 0
     return (
         rows[is_claimed],
         part_of[is_claimed],
         np.array(parents, dtype=np.int32),
         np.array(is_house, dtype=np.bool_),
+        np.array(is_extension, dtype=np.bool_),
     )
 
 

@@ -9,8 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from loda_pdal.kernels.neighbours import nearest
+from loda_pdal.model.boxes import upright_boxes
 from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array
-from loda_pdal.model.groups import Groups
+from loda_pdal.model.groups import Groups, count_cells
 from loda_pdal.model.pair import Pair
 from loda_pdal.stages.cues import Surface
 
@@ -30,6 +31,11 @@ _NEAR_M = 0.35
 _FAR_M = 1.0
 """Residual of points with nothing closer."""
 
+_LEAST_M = (1.2, 2.2, 1.1)
+"""Width, length and height of what can be a vehicle."""
+
+_LEAST_FILL = 0.6
+_CELL_M = 0.5
 _MIN_POINTS = 30
 _APART_M = 100.0
 """Vehicles are lifted so far from each other that none sees another: one search serves them all."""
@@ -76,6 +82,19 @@ def shape_change(surfaces: Pair[Surface], is_open: Pair[BoolArray], is_asked: Bo
         len(is_asked),
     )
     return np.fmin(before, after)
+
+
+def looks_like_vehicle(surfaces: Pair[Surface], n: int) -> BoolArray:
+    """Which objects (n,) have the size of a vehicle in both epochs and fill their box: no wall, hedge or bin, and no two
+    of them in one piece."""
+    fits = np.ones(n, np.bool_)
+    for side in surfaces:
+        size = upright_boxes(side.xyz, side.owner, n).size
+        width, length = np.sort(size[:, :2], axis=1).T
+        filled = count_cells(side.xyz[:, :2], side.owner, n, _CELL_M) * _CELL_M**2
+        fits &= (width > _LEAST_M[0]) & (length > _LEAST_M[1]) & (size[:, 2] > _LEAST_M[2])
+        fits &= filled > _LEAST_FILL * width * length
+    return fits
 
 
 def _lifted(surface: Surface, members: Int64Array, lift: Int64Array) -> FloatArray:
