@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loda_pdal.benchmark.simulate import SimulatedBlock, SimulationOptions, simulate_block
+from loda_pdal.benchmark.simulate import Reality, SimulatedBlock, SimulationOptions, simulate_block
 from loda_pdal.kernels.parallel import set_threads
 from loda_pdal.model.cloud import FloatArray, to_local_grid
 from loda_pdal.model.frame import LocalFrame
@@ -19,7 +19,7 @@ from loda_pdal.model.transform import invert, transform_points
 from loda_pdal.params import PRESETS, Parameters
 from loda_pdal.pipeline import detect_changes
 
-SMALL = SimulationOptions(length_m=60.0, density=0.6)
+SMALL = SimulationOptions(length_m=60.0, density=0.6, reality=Reality.none())
 
 
 def survey(xyz: FloatArray, shift: float = 0.0) -> Survey:
@@ -130,7 +130,7 @@ def test_swapping_the_epochs_swaps_the_labels(block: SimulatedBlock, result: Cha
     ],
 )
 def test_every_choice_obeys_the_swap(choice: str) -> None:
-    scene = simulate_block(12, replace(SMALL, density=0.3))
+    scene = simulate_block(12, replace(SMALL, density=0.3, reality=Reality()))
     before, after = (survey(side.xyz) for side in scene.surveys)
     parameters = Parameters().with_setting(choice)
     there, back = detect_changes(before, after, parameters), detect_changes(after, before, parameters)

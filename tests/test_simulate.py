@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import laspy
@@ -13,19 +14,21 @@ from scipy.spatial import cKDTree
 
 from loda_pdal.benchmark.commands import bench
 from loda_pdal.benchmark.simulate import (
+    Reality,
     SimulatedBlock,
     SimulationOptions,
     fused_block,
     simulate_block,
     write_block,
 )
-from loda_pdal.benchmark.simulate.block import EpochScene, epoch_scenes
 from loda_pdal.benchmark.simulate.edits import EditCounts, draw_edits
+from loda_pdal.benchmark.simulate.epochs import EpochScene, epoch_scenes
 from loda_pdal.benchmark.simulate.objects import Car, House
 from loda_pdal.benchmark.simulate.raycast import RayCaster, normals_of
 from loda_pdal.benchmark.simulate.scene import GroundPatch, Placed, Terrain, draw_street
 from loda_pdal.benchmark.simulate.sensor import Drive, Sensor, drive, scan, sees
 from loda_pdal.benchmark.simulate.shapes import EMPTY, Material, Opening, Shape, box, joined, leaves, of_triangles, wall
+from loda_pdal.benchmark.simulate.world import World
 from loda_pdal.benchmark.truth import Truth
 from loda_pdal.kernels.parallel import set_threads
 from loda_pdal.model.errors import InputError, OutputError, ParameterError
@@ -47,7 +50,7 @@ def scenes() -> Pair[EpochScene]:
     street = draw_street(np.random.default_rng(5), 60.0)
     terrain = street.terrain
     items, grounds = draw_edits(street, np.random.default_rng(6), EditCounts())
-    return epoch_scenes(terrain, items, grounds, seed=5)
+    return epoch_scenes(terrain, items, grounds, Pair(*np.random.default_rng(5).spawn(2)))
 
 
 def nearest_by_brute_force(shape: Shape, origin: np.ndarray, direction: np.ndarray) -> tuple[float, int]:
@@ -108,7 +111,7 @@ def test_every_return_without_noise_lies_on_its_surface(scenes: Pair[EpochScene]
     random = np.random.default_rng(0)
     terrain = Terrain(60.0, 0.01, 0.0, (0.1, 0.05), (0.0, 1.0))
     surface = scenes.after.surface
-    measured = scan(exact, surface, drive(exact, terrain, (-1.6, 1.6), 5.0, random), random)
+    measured = scan(exact, World(surface), drive(exact, terrain, (-1.6, 1.6), 5.0, random), random)
     assert len(measured.xyz) > 20_000
     is_triangle = measured.primitive < len(surface.triangles)
     triangles = surface.triangles[measured.primitive[is_triangle]]
@@ -131,7 +134,7 @@ def test_noise_moves_returns_along_their_rays() -> None:
     flat = Terrain(40.0, 0.0, 0.0, (0.0, 0.0), (0.0, 0.0))
     noisy = Sensor(noise_m=0.05, drift_m=0.0, drift_deg=0.0, column_share=0.004)
     path = drive(noisy, flat, (-1.6,), 0.0, np.random.default_rng(0))
-    measured = scan(noisy, screen, path, np.random.default_rng(1))
+    measured = scan(noisy, World(screen), path, np.random.default_rng(1))
     station = np.searchsorted(path.time, measured.time)
     ray = measured.xyz - path.position[station]
     range_m = np.linalg.norm(ray, axis=1)
@@ -149,7 +152,7 @@ def test_what_stands_behind_a_wall_is_not_seen() -> None:
     path = drive(sensor, flat, (-1.6, 1.6), 5.0, np.random.default_rng(0))
 
     def returns_from_target(shape: Shape) -> int:
-        measured = scan(sensor, shape, path, np.random.default_rng(1))
+        measured = scan(sensor, World(shape), path, np.random.default_rng(1))
         return int(np.count_nonzero(measured.primitive < len(target)))
 
     assert returns_from_target(target) > 500
@@ -157,11 +160,11 @@ def test_what_stands_behind_a_wall_is_not_seen() -> None:
 
     corners = np.array([[18.0, 12.0, 3.0], [22.0, 12.0, 1.5]])
     none, all_of_it = np.zeros(len(screen), dtype=bool), np.ones(len(screen), dtype=bool)
-    assert sees(sensor, RayCaster(EMPTY), path, corners, np.zeros(1, dtype=bool)).all()
-    assert not sees(sensor, RayCaster(screen), path, corners, none).any()
-    assert sees(sensor, RayCaster(screen), path, corners, all_of_it).all()
+    assert sees(sensor, World(), path, corners, np.zeros(1, dtype=bool)).all()
+    assert not sees(sensor, World(screen), path, corners, none).any()
+    assert sees(sensor, World(screen), path, corners, all_of_it).all()
     too_high = np.array([[20.0, 12.0, 90.0]])
-    assert not sees(sensor, RayCaster(EMPTY), path, too_high, np.zeros(1, dtype=bool)).any()
+    assert not sees(sensor, World(), path, too_high, np.zeros(1, dtype=bool)).any()
 
 
 def test_the_drive_keeps_its_lanes_and_its_drift_small() -> None:
@@ -218,7 +221,7 @@ def test_primitives_belong_to_the_thing_that_made_them() -> None:
     terrain = Terrain(60.0, 0.0, 0.0, (0.0, 0.0), (0.0, 0.0))
     street = draw_street(np.random.default_rng(5), 60.0)
     items, grounds = draw_edits(street, np.random.default_rng(6), EditCounts())
-    scene = epoch_scenes(terrain, items, grounds, seed=5).after
+    scene = epoch_scenes(terrain, items, grounds, Pair(*np.random.default_rng(5).spawn(2))).after
     corners = np.concatenate([scene.surface.triangles.mean(axis=1), scene.surface.discs[:, :3]])
     cars = [i for i in items if i.after is not None and isinstance(i.after.thing, Car)]
     assert len(cars) > 5
@@ -317,7 +320,7 @@ def test_a_street_without_edits_has_none() -> None:
 
 def test_misregistration_is_what_the_truth_says() -> None:
     small = SimulationOptions(length_m=40.0, density=0.05, shift_m=0.0, rotation_deg=0.0)
-    large = SimulationOptions(length_m=40.0, density=0.05, shift_m=3.0, rotation_deg=10.0)
+    large = replace(small, shift_m=3.0, rotation_deg=10.0)
     still, moved = simulate_block(11, small), simulate_block(11, large)
     np.testing.assert_array_equal(still.surveys.after.xyz, moved.surveys.after.xyz)
     np.testing.assert_allclose(still.truth.T_after_before, np.eye(4), atol=1e-12)
@@ -331,7 +334,7 @@ def test_misregistration_is_what_the_truth_says() -> None:
 
 def test_density_and_lanes() -> None:
     def n_points(density: float, lanes: tuple[float, ...]) -> int:
-        options = SimulationOptions(length_m=40.0, density=density, lanes=lanes)
+        options = SimulationOptions(length_m=40.0, density=density, lanes=lanes, reality=Reality.none())
         return len(simulate_block(2, options).surveys.after)
 
     both = n_points(0.1, (-1.6, 1.6))
@@ -406,3 +409,6 @@ def test_simulate_command(tmp_path: Path) -> None:
     assert Truth.read(out / "truth.json").made_by["seed"] == 5
     result = CliRunner().invoke(bench, [*asked, "--overwrite", "--leaf", "0.25"])
     assert json.loads(result.output)["points"]["before"] < summary["points"]["before"]
+    result = CliRunner().invoke(bench, [*asked, "--overwrite", "--plain"])
+    assert Truth.read(out / "truth.json").made_by["options"]["reality"]["traffic"] == 0.0
+    assert result.exit_code == 0 and not any(i.edit == "passing by" for i in Truth.read(out / "truth.json").instances)

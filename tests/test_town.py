@@ -15,6 +15,8 @@ from loda_pdal.benchmark.simulate.block import SimulatedBlock
 from loda_pdal.benchmark.simulate.city_model import read_city_model
 from loda_pdal.benchmark.simulate.sensor import scan
 from loda_pdal.benchmark.simulate.shapes import Material, box, distance_to_triangles, quads
+from loda_pdal.benchmark.simulate.town import ModelHouse, party_walls
+from loda_pdal.benchmark.simulate.world import World
 from loda_pdal.model.errors import InputError
 from loda_pdal.model.labels import ChangeLabel
 from loda_pdal.model.transform import transform_points
@@ -84,6 +86,20 @@ def test_a_house_is_read_with_its_size(tmp_path: Path) -> None:
         assert area == pytest.approx(2 * 50 + 2 * (40 + 12) + 2 * 10 * 5, rel=1e-9)  # walls, gables, roof; no floor
 
 
+def test_a_house_whose_model_lacks_a_wall_gets_one(tmp_path: Path) -> None:
+    document = _city([(100.0, 200.0)])
+    del document["CityObjects"]["house 0"]["geometry"][0]["boundaries"][0][3]  # the gable wall at the right
+    path = tmp_path / "a.city.json"
+    path.write_text(json.dumps(document), encoding="utf-8")
+    (house,) = read_city_model(path)
+    walls = party_walls(ModelHouse(house.name, house.triangles - (0.0, 0.0, house.foot_m), house.footprint))
+    np.testing.assert_allclose(walls[:, :, 0], 110.0, atol=1e-6)
+    assert walls[:, :, 2].max() == pytest.approx(8.0, abs=0.5)
+    edges = np.diff(walls, axis=1)
+    area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum() / 2
+    assert area == pytest.approx(40 + 12, rel=0.1)
+
+
 def test_what_is_no_city_model_is_named(tmp_path: Path) -> None:
     path = tmp_path / "roads.json"
     path.write_text("[1, 2", encoding="utf-8")
@@ -98,7 +114,7 @@ def test_the_aircraft_leaves_the_density_that_was_asked_for() -> None:
     sensor = AirborneSensor(60.0, 50.0, density=8.0, noise_m=0.0, strip_shift_m=0.0, drift_m=0.0, drift_deg=0.0)
     random = np.random.default_rng(5)
     ground = quads(np.array([[(-80, -80, 0), (140, -80, 0), (140, 80, 0), (-80, 80, 0)]]), Material.GRASS)
-    found = scan(sensor, ground, fly(sensor, 0.0, random), random)
+    found = scan(sensor, World(ground), fly(sensor, 0.0, random), random)
     x, y, z = found.xyz.T
     is_inside = (x > 5) & (x < 55) & (np.abs(y) < 20)
     assert np.abs(z).max() < 1e-6

@@ -31,6 +31,9 @@ def bench() -> None:
     "--leaf", type=click.FloatRange(min=0.01), metavar="M", help="Write one mean point per voxel of this edge."
 )
 @click.option("--no-edits", is_flag=True, help="Survey an unchanged street twice.")
+@click.option(
+    "--plain", is_flag=True, help="A tidy, empty street on two days alike: no traffic, clutter, windows, rain or gaps."
+)
 @click.option("--overwrite", is_flag=True, help="Replace files that are there already.")
 @click.option("--json", "as_json", is_flag=True, help="Write the summary as JSON.")
 def simulate(
@@ -48,11 +51,12 @@ def simulate(
     noise: float,
     leaf: float | None,
     no_edits: bool,
+    plain: bool,
     overwrite: bool,
     as_json: bool,
 ) -> None:
     """Make a block of a street or city, survey it twice, and write before.laz, after.laz and truth.json to OUT."""
-    from loda_pdal.benchmark.simulate import SimulationOptions, fused_block, simulate_block, write_block
+    from loda_pdal.benchmark.simulate import Reality, SimulationOptions, fused_block, simulate_block, write_block
 
     options = SimulationOptions(
         length_m=length,
@@ -66,6 +70,7 @@ def simulate(
         rotation_deg=rotation,
         noise_m=noise,
         has_edits=not no_edits,
+        reality=Reality.none() if plain else Reality(),
     )
     block = simulate_block(seed, options)
     if leaf is not None:

@@ -108,7 +108,7 @@ def project(application):
 def surveys(engine_program, tmp_path_factory):
     """Folder of before.laz and after.laz: sixty metres of street with changes of every kind."""
     folder = tmp_path_factory.mktemp("surveys")
-    options = ["--seed", "1", "--length", "60", "--density", "0.5", "--overwrite"]
+    options = ["--seed", "1", "--length", "60", "--density", "0.5", "--plain", "--overwrite"]
     subprocess.run([engine_program, "bench", "simulate", *options, folder], check=True, stdout=subprocess.DEVNULL)
     return folder
 

@@ -1,7 +1,8 @@
-"""Simulated street blocks: a procedural street, edits with labels, a ray-cast vehicle LiDAR, files with truth.
+"""Simulated blocks: a procedural street or a piece of a city, edits with labels, ray-cast surveys, files with truth.
 
-``scene`` and ``objects`` say what stands where, ``edits`` what changed, ``sensor`` how it was measured, ``block``
-puts both surveys and the truth together, ``writer`` makes files of them.
+``scene``, ``objects``, ``furniture`` and ``town`` say what stands where, ``edits`` and ``clutter`` what changed,
+``traffic`` who passes by, ``plan`` how each survey is made and ``sensor`` how its pulses come back, ``evidence`` which
+instances the surveys allow to be judged; ``block`` puts both surveys and the truth together, ``writer`` makes files.
 """
 
 from __future__ import annotations
@@ -9,10 +10,18 @@ from __future__ import annotations
 from loda_pdal.benchmark.simulate.block import (
     SimulatedBlock,
     SimulatedSurvey,
-    SimulationOptions,
     fused_block,
     simulate_block,
 )
+from loda_pdal.benchmark.simulate.options import Reality, SimulationOptions
 from loda_pdal.benchmark.simulate.writer import write_block
 
-__all__ = ["SimulatedBlock", "SimulatedSurvey", "SimulationOptions", "fused_block", "simulate_block", "write_block"]
+__all__ = [
+    "Reality",
+    "SimulatedBlock",
+    "SimulatedSurvey",
+    "SimulationOptions",
+    "fused_block",
+    "simulate_block",
+    "write_block",
+]

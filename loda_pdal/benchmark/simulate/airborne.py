@@ -43,6 +43,7 @@ class AirborneSensor:
     drift_m: float = 0.01
     drift_deg: float = 0.001
     bright_range_m: float = 900.0
+    max_returns: int = 3
 
     @property
     def max_range_m(self) -> float:

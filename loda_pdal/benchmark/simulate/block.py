@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from loda_pdal.benchmark.simulate.airborne import AirborneSensor, fly
 from loda_pdal.benchmark.simulate.city_model import read_city_model
-from loda_pdal.benchmark.simulate.edits import UNCHANGED, EditCounts, GroundItem, Item, draw_edits
-from loda_pdal.benchmark.simulate.raycast import RayCaster
+from loda_pdal.benchmark.simulate.clutter import add_clutter
+from loda_pdal.benchmark.simulate.edits import EditCounts, GroundItem, Item, draw_edits
+from loda_pdal.benchmark.simulate.epochs import EpochScene, changes_of_returns, epoch_scenes
+from loda_pdal.benchmark.simulate.evidence import Evidence, instances_of
+from loda_pdal.benchmark.simulate.options import SimulationOptions
+from loda_pdal.benchmark.simulate.plan import SurveyPlan, draw_plans
 from loda_pdal.benchmark.simulate.scene import Ground, draw_street
-from loda_pdal.benchmark.simulate.sensor import Drive, Scan, Scanner, Sensor, drive, rigid_move, scan, sees
-from loda_pdal.benchmark.simulate.shapes import EMPTY, Shape, distance_to_triangles, joined
-from loda_pdal.benchmark.simulate.town import ModelHouse, draw_town, draw_town_edits
-from loda_pdal.benchmark.truth import Truth, TruthInstance
-from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, Int64Array
-from loda_pdal.model.errors import ParameterError
+from loda_pdal.benchmark.simulate.sensor import Drive, rigid_move, scan
+from loda_pdal.benchmark.simulate.town import draw_town, draw_town_edits
+from loda_pdal.benchmark.simulate.traffic import CYCLE_Y_M, draw_traffic
+from loda_pdal.benchmark.simulate.world import World
+from loda_pdal.benchmark.truth import Truth
+from loda_pdal.model.cloud import ByteArray, FloatArray, Int64Array
 from loda_pdal.model.frame import LocalFrame
-from loda_pdal.model.labels import ChangeLabel, ObjectClass
+from loda_pdal.model.labels import ChangeLabel
 from loda_pdal.model.pair import Pair
 from loda_pdal.model.transform import invert, transform_points
 from loda_pdal.params import FuseParams
@@ -32,81 +34,19 @@ CRS = "EPSG:7415"
 COORDINATE_STEP_M = 0.001
 """Coordinates are whole multiples of this, as a LAS file stores them."""
 
-_STREET, _EDITS, _PLACE, _MOVE = 1, 2, 3, 4
+_STREET, _EDITS, _PLACE, _MOVE, _CLUTTER, _EXTENT = 1, 2, 3, 4, 5, 6
 _SURVEY = Pair(10, 11)
 _FOLIAGE = Pair(20, 21)
+_DAY = Pair(30, 31)
+_TRAFFIC = Pair(40, 41)
+_ECHOES = Pair(50, 51)
 """Numbers of the independent random streams that one seed gives."""
+
+PAVEMENT_Y_M = 6.1
+"""Where people walk in a procedural street, m from its middle."""
 
 _START_TIME = Pair(371_722_418.0, 435_226_418.0)
 """Adjusted standard GPS time (s) at which each survey begins: ten in the morning of the days in `writer`."""
-
-
-@dataclass(frozen=True)
-class SimulationOptions:
-    """How a block is made. Lengths in m.
-
-    Attributes
-    ----------
-    length_m, width_m : float
-        Extent along and across the street.
-    city : str
-        CityJSON file that the buildings come from; empty for a procedural street.
-    sensor : str
-        ``vehicle`` or ``airborne``.
-    density : float
-        Pulses per survey; 1 gives about 0.65 million returns from 100 m of street, or 10 pulses per m2 from the air.
-    density_after : float
-        Pulses of the later survey, relative to the earlier one.
-    lanes : tuple of float
-        One pass of the vehicle per entry: where it drives, m from the middle of the street.
-    shift_m, rotation_deg : float
-        Residual misregistration of the before epoch: how far it is moved, and turned about the middle of the block.
-    noise_m, drift_m : float
-        Range noise, and slow pose error.
-    has_edits : bool
-        False surveys an unchanged street twice, with fresh noise and foliage.
-    min_returns : int
-        Fewer returns in a survey that an instance stands in leave it out of the scores.
-    min_visible : float
-        So does a smaller share of its place that the other survey could have measured.
-    """
-
-    length_m: float = 100.0
-    width_m: float = 56.0
-    city: str = ""
-    sensor: str = "vehicle"
-    density: float = 1.0
-    density_after: float = 1.0
-    lanes: tuple[float, ...] = (-1.6, 1.6)
-    shift_m: float = 0.05
-    rotation_deg: float = 0.2
-    noise_m: float = 0.02
-    drift_m: float = 0.02
-    has_edits: bool = True
-    min_returns: int = 30
-    min_visible: float = 0.25
-
-    def __post_init__(self) -> None:
-        for name, low, high in (
-            ("length_m", 30.0, 2000.0),
-            ("width_m", 10.0, 80.0 if not self.city else 400.0),
-            ("density", 0.01, 20.0),
-            ("density_after", 0.1, 10.0),
-            ("shift_m", 0.0, 100.0),
-            ("rotation_deg", 0.0, 180.0),
-            ("noise_m", 0.0, 1.0),
-            ("drift_m", 0.0, 1.0),
-        ):
-            if not low <= getattr(self, name) <= high:
-                raise ParameterError(
-                    f"{name} = {getattr(self, name)} is outside {low} to {high}.",
-                    "Choose a value in that range.",
-                    "parameter-range",
-                )
-        if self.sensor not in ("vehicle", "airborne"):
-            raise ParameterError(f"No sensor {self.sensor!r}.", "Choose vehicle or airborne.", "parameter-range")
-        if not self.lanes:
-            raise ParameterError("No lane to drive on.", "Give at least one.", "parameter-range")
 
 
 @dataclass(frozen=True)
@@ -123,6 +63,8 @@ class SimulatedSurvey:
         `ChangeLabel` of the surface hit: a change only where the other survey's street does not have that surface.
     gps_time : (n,) float64, s
     intensity : (n,) uint16
+    return_number, n_returns : (n,) uint8
+        The how manieth return of its pulse, from 1, and of how many.
     trajectory : (k, 4) float64
         GPS time (s) and recorded position of the scanner (map coordinates, m).
     """
@@ -132,6 +74,8 @@ class SimulatedSurvey:
     truth_change: ByteArray
     gps_time: FloatArray
     intensity: npt.NDArray[np.uint16]
+    return_number: ByteArray
+    n_returns: ByteArray
     trajectory: FloatArray
 
     def __len__(self) -> int:
@@ -146,15 +90,6 @@ class SimulatedBlock:
     truth: Truth
     seed: int
     options: SimulationOptions
-
-
-@dataclass(frozen=True)
-class EpochScene:
-    """Everything that stands at one survey: its surface, and for each primitive whose it is and what became of it."""
-
-    surface: Shape
-    owner: Int64Array
-    change: ByteArray
 
 
 def simulate_block(seed: int, options: SimulationOptions | None = None) -> SimulatedBlock:
@@ -173,32 +108,33 @@ def simulate_block(seed: int, options: SimulationOptions | None = None) -> Simul
     """
     options = options or SimulationOptions()
     terrain, items, grounds = _contents(seed, options)
-    scenes = epoch_scenes(terrain, items, grounds, seed)
-    randoms = _SURVEY.map(lambda code: _stream(seed, code))
-    surveyed = randoms.join(
-        Pair(options.density, options.density * options.density_after),
-        lambda random, density: _survey_plan(options, density, terrain, random),
+    plans = draw_plans(
+        options,
+        terrain,
+        _SURVEY.map(lambda code: _stream(seed, code)),
+        _DAY.map(lambda code: _stream(seed, code)),
+        _stream(seed, _EXTENT),
     )
-    sensors, drives = surveyed.map(lambda plan: plan[0]), surveyed.map(lambda plan: plan[1])
+    foliage = _FOLIAGE.map(lambda code: _stream(seed, code))
+    scenes = epoch_scenes(terrain, items, grounds, foliage, plans.map(lambda plan: plan.leaf_share))
+    scenes = _with_traffic(seed, options, terrain, plans, scenes)
+    worlds = scenes.map(lambda scene: World(scene.surface, scene.movers))
+    randoms = _ECHOES.map(lambda code: _stream(seed, code))
     scans = Pair(
-        scan(sensors.before, scenes.before.surface, drives.before, randoms.before),
-        scan(sensors.after, scenes.after.surface, drives.after, randoms.after),
-    ).map(lambda measured: _cropped(measured, options))
-    changes = _changes_of_returns(scenes, scans, items)
+        *(
+            plan.cropped(scan(plan.scanner, world, plan.path, random, plan.conditions))
+            for plan, world, random in zip(plans, worlds, randoms, strict=True)
+        )
+    )
+    changes = changes_of_returns(scenes, scans, items)
+    evidence = Pair(*(Evidence(*parts) for parts in zip(plans, scenes, worlds, scans, changes, strict=True)))
 
     T_map_street = _placement(_stream(seed, _PLACE), options)
     T_before_after = _misregistration(_stream(seed, _MOVE), options, T_map_street)
-    instances = _instances(sensors, items, grounds, scenes, scans, changes, drives, T_map_street, options)
+    instances = instances_of(items, grounds, evidence, T_map_street, options)
     surveys = Pair(
-        _survey(
-            scans.before,
-            scenes.before,
-            changes.before,
-            drives.before,
-            T_before_after @ T_map_street,
-            _START_TIME.before,
-        ),
-        _survey(scans.after, scenes.after, changes.after, drives.after, T_map_street, _START_TIME.after),
+        _survey(evidence.before, T_before_after @ T_map_street, _START_TIME.before),
+        _survey(evidence.after, T_map_street, _START_TIME.after),
     )
     truth = Truth(
         instances,
@@ -206,11 +142,7 @@ def simulate_block(seed: int, options: SimulationOptions | None = None) -> Simul
         _outline(T_map_street, options),
         options.length_m * options.width_m,
         CRS,
-        {
-            "program": "loda-pdal bench simulate",
-            "seed": seed,
-            "options": {**asdict(options), "lanes": list(options.lanes)},
-        },
+        {"program": "loda-pdal bench simulate", "seed": seed, "options": options.to_dict()},
     )
     return SimulatedBlock(surveys, truth, seed, options)
 
@@ -230,6 +162,8 @@ def fused_block(block: SimulatedBlock, leaf_m: float) -> SimulatedBlock:
             survey.truth_change[first],
             survey.gps_time[first],
             survey.intensity[first],
+            survey.return_number[first],
+            survey.n_returns[first],
             survey.trajectory,
         )
 
@@ -242,110 +176,36 @@ def _stream(seed: int, purpose: int) -> np.random.Generator:
 
 
 def _contents(seed: int, options: SimulationOptions) -> tuple[Ground, list[Item], list[GroundItem]]:
-    """What the block holds, with what changes: a street, or a piece of a city."""
+    """What the block holds, with what changes: a street or a piece of a city, and what clutters it."""
     if not options.city:
         street = draw_street(_stream(seed, _STREET), options.length_m)
         counts = EditCounts() if options.has_edits else None
-        return street.terrain, *draw_edits(street, _stream(seed, _EDITS), counts)
-    buildings = read_city_model(options.city)
-    needs_street = options.sensor == "vehicle"
-    town = draw_town(buildings, _stream(seed, _STREET), options.length_m, options.width_m, needs_street)
-    return town.terrain, *draw_town_edits(town, _stream(seed, _EDITS), options.has_edits)
+        ground: Ground = street.terrain
+        items, patches = draw_edits(street, _stream(seed, _EDITS), counts)
+    else:
+        buildings = read_city_model(options.city)
+        needs_street = options.sensor == "vehicle"
+        town = draw_town(buildings, _stream(seed, _STREET), options.length_m, options.width_m, needs_street)
+        ground = town.terrain
+        items, patches = draw_town_edits(town, _stream(seed, _EDITS), options.has_edits)
+    items = add_clutter(items, patches, ground, _stream(seed, _CLUTTER), options)
+    return ground, items, patches
 
 
-def _survey_plan(
-    options: SimulationOptions, density: float, terrain: Ground, random: np.random.Generator
-) -> tuple[Scanner, Drive]:
-    """The scanner of one survey and its way."""
-    if options.sensor == "airborne":
-        plane = AirborneSensor(
-            options.length_m, options.width_m, 10.0 * density, noise_m=options.noise_m, strip_shift_m=options.drift_m
-        )
-        return plane, fly(plane, 0.0, random)
-    car = Sensor(noise_m=options.noise_m, drift_m=options.drift_m, drift_deg=1.5 * options.drift_m)
-    car = replace(car, column_share=min(car.column_share * density, 1.0))
-    return car, drive(car, terrain, options.lanes, 12.0, random)
-
-
-def _changes_of_returns(scenes: Pair[EpochScene], scans: Pair[Scan], items: list[Item]) -> Pair[ByteArray]:
-    """`ChangeLabel` of the surface under each return, (n,) per survey.
-
-    A primitive that only one survey has may lie in a surface that both have (a wall under a new storey): of buildings
-    of a city model that grew or shrank, returns from such places are unchanged. (Houses of a street are built so that
-    they share such primitives.)
-    """
-    grown = [i for i in items if i.before and i.after and i.edit and isinstance(i.placed.thing, ModelHouse)]
-    changes = scenes.join(scans, lambda scene, measured: scene.change[measured.primitive])
-    for item in grown:
-        surface = scenes.map(lambda scene, owner=item.instance_id: _surface_of(scene, owner))  # type: ignore[misc]
-        for scene, measured, change, other in zip(scenes, scans, changes, surface.swapped, strict=True):
-            at = np.flatnonzero((scene.owner[measured.primitive] == item.instance_id) & (change != UNCHANGED))
-            change[at[distance_to_triangles(measured.xyz[at], other) < _SAME_SURFACE_M]] = UNCHANGED
-    return changes
-
-
-def _surface_of(scene: EpochScene, instance_id: int) -> FloatArray:
-    """Triangles of one instance."""
-    triangles = scene.surface.triangles
-    return np.asarray(triangles[scene.owner[: len(triangles)] == instance_id])
-
-
-_SAME_SURFACE_M = 0.12
-"""Returns this near to the other survey's surface of the same building show nothing that changed."""
-
-
-def epoch_scenes(terrain: Ground, items: list[Item], grounds: list[GroundItem], seed: int) -> Pair[EpochScene]:
-    """Both states of the street, ready to be surveyed; foliage is drawn anew for each."""
-    outlines = [g.patch for g in grounds]
-    ground_ids = np.array([g.instance_id for g in grounds] + [0])
-    ground_labels = np.array([g.label for g in grounds] + [ChangeLabel.UNCHANGED], dtype=np.uint8)
-    foliage = _FOLIAGE.map(lambda code: _stream(seed, code))
-    parts: Pair[list[EpochScene]] = Pair([], [])
-    for into, patches in ((parts.before, []), (parts.after, outlines)):
-        ground, patch = terrain.surface(patches, outlines)
-        into.append(EpochScene(ground, ground_ids[patch], ground_labels[patch]))
-    for item in items:
-        before = item.before.surface(terrain, foliage.before) if item.before else EMPTY
-        after = item.after.surface(terrain, foliage.after) if item.after else EMPTY
-        parts.before.append(_item_scene(item, before, after))
-        parts.after.append(_item_scene(item, after, before))
-    return parts.map(_joined_scene)
-
-
-def _item_scene(item: Item, shape: Shape, other: Shape) -> EpochScene:
-    is_changed = _is_only_here(shape, other) & (item.label is not ChangeLabel.UNCHANGED)
-    change = np.where(is_changed, item.label, ChangeLabel.UNCHANGED).astype(np.uint8)
-    return EpochScene(shape, np.full(len(shape), item.instance_id), change)
-
-
-def _joined_scene(parts: list[EpochScene]) -> EpochScene:
-    """All parts as one; triangles come before discs, here as in `Shape`."""
-    n_triangles = [len(p.surface.triangles) for p in parts]
-    split = [(p.owner[:n], p.owner[n:], p.change[:n], p.change[n:]) for p, n in zip(parts, n_triangles, strict=True)]
-    owner_of_triangle, owner_of_disc, change_of_triangle, change_of_disc = zip(*split, strict=True)
-    return EpochScene(
-        joined(p.surface for p in parts),
-        np.concatenate([*owner_of_triangle, *owner_of_disc]),
-        np.concatenate([*change_of_triangle, *change_of_disc]),
-    )
-
-
-def _is_only_here(shape: Shape, other: Shape) -> BoolArray:
-    """Which primitives the other epoch's surface of the same thing does not have, triangles first; leaves count as
-    gone, since they are never the same twice."""
-    is_only = np.ones(len(shape), dtype=bool)
-    known = {row.tobytes() for row in np.round(other.triangles * 1e4).astype(np.int64)}
-    mine = np.round(shape.triangles * 1e4).astype(np.int64)
-    is_only[: len(mine)] = [row.tobytes() not in known for row in mine]
-    return is_only
-
-
-def _cropped(measured: Scan, options: SimulationOptions) -> Scan:
-    """The returns inside the block."""
-    x, y = measured.xyz[:, 0], measured.xyz[:, 1]
-    is_inside = (x >= 0) & (x < options.length_m) & (np.abs(y) < options.width_m / 2)
-    return Scan(
-        measured.xyz[is_inside], measured.primitive[is_inside], measured.time[is_inside], measured.intensity[is_inside]
+def _with_traffic(
+    seed: int, options: SimulationOptions, terrain: Ground, plans: Pair[SurveyPlan], scenes: Pair[EpochScene]
+) -> Pair[EpochScene]:
+    """The scenes with who passes by while the vehicle scans."""
+    amount = options.reality.traffic
+    if options.sensor != "vehicle" or not options.has_edits or not amount:
+        return scenes
+    walk_y_m = CYCLE_Y_M if options.city else PAVEMENT_Y_M
+    randoms = _TRAFFIC.map(lambda code: _stream(seed, code))
+    passers = plans.join(randoms, lambda plan, random: draw_traffic(plan.path, terrain, amount, walk_y_m, random))
+    first_id = int(max(scenes.before.owner.max(initial=0), scenes.after.owner.max(initial=0))) + 1
+    return Pair(
+        scenes.before.with_movers(passers.before, first_id, ChangeLabel.REMOVED),
+        scenes.after.with_movers(passers.after, first_id + len(passers.before), ChangeLabel.ADDED),
     )
 
 
@@ -370,121 +230,36 @@ def _misregistration(random: np.random.Generator, options: SimulationOptions, T_
     return rigid_move(shift, turn, centre)
 
 
-def _survey(
-    measured: Scan, scene: EpochScene, change: ByteArray, path: Drive, T_map_street: FloatArray, start_time: float
-) -> SimulatedSurvey:
-    station = np.unique(np.round(np.linspace(0, len(path.time) - 1, 400)).astype(int))
+def _survey(one: Evidence, T_map_street: FloatArray, start_time: float) -> SimulatedSurvey:
+    measured, path = one.measured, one.plan.path
+    station = _stations(path)
     positions = transform_points(T_map_street, path.recorded[station])
     xyz = transform_points(T_map_street, measured.xyz)
     return SimulatedSurvey(
         np.round(xyz / COORDINATE_STEP_M) * COORDINATE_STEP_M,
-        scene.owner[measured.primitive].astype(np.uint32),
-        change,
+        one.scene.owner[measured.primitive].astype(np.uint32),
+        one.change,
         start_time + measured.time,
         measured.intensity,
+        measured.return_number,
+        measured.n_returns,
         np.column_stack([start_time + path.time[station], positions]),
     )
+
+
+def _stations(path: Drive) -> Int64Array:
+    """Which columns of a drive its trajectory lists: both ends of each pass, and `_STATIONS_PER_S` a second between."""
+    number = np.floor((path.time - path.time[:1]) * _STATIONS_PER_S).astype(np.int64)
+    is_next = np.diff(number, prepend=-1) > 0
+    is_last = np.diff(path.time, append=np.inf) > 1.0
+    return np.flatnonzero(is_next | is_last)
+
+
+_STATIONS_PER_S = 10.0
+"""Rows of a trajectory per second that was driven: half a metre on the road, six in the air."""
 
 
 def _outline(T_map_street: FloatArray, options: SimulationOptions) -> list[tuple[float, float]]:
     half, length = options.width_m / 2, options.length_m
     corners = np.array([(0.0, -half, 0.0), (length, -half, 0.0), (length, half, 0.0), (0.0, half, 0.0)])
     return [(round(float(x), 3), round(float(y), 3)) for x, y, _ in transform_points(T_map_street, corners)]
-
-
-def _instances(
-    sensors: Pair[Scanner],
-    items: list[Item],
-    grounds: list[GroundItem],
-    scenes: Pair[EpochScene],
-    scans: Pair[Scan],
-    changes: Pair[ByteArray],
-    drives: Pair[Drive],
-    T_map_street: FloatArray,
-    options: SimulationOptions,
-) -> list[TruthInstance]:
-    """The truth about every instance, with what the surveys caught of it."""
-    casters = scenes.map(lambda scene: RayCaster(scene.surface))
-    n_ids = max([i.instance_id for i in items] + [g.instance_id for g in grounds], default=0) + 1
-    caught = Pair(
-        _caught(scenes.before, scans.before, changes.before, n_ids),
-        _caught(scenes.after, scans.after, changes.after, n_ids),
-    )
-
-    def instance_of(one: Item | GroundItem, kind: str, object_class: ObjectClass, exists: Pair[bool]) -> TruthInstance:
-        points = np.concatenate([c.points[one.instance_id] for c in caught])
-        sample = points[np.unique(np.linspace(0, len(points) - 1, 100).astype(int))] if len(points) else points
-        replaced_by = (one.partner if isinstance(one, Item) else None) or -1
-
-        def visible_share(
-            stands: bool, sensor: Scanner, caster: RayCaster, path: Drive, scene: EpochScene
-        ) -> float | None:
-            return None if stands else _share(sees(sensor, caster, path, sample, scene.owner == replaced_by))
-
-        instance = TruthInstance(
-            one.instance_id,
-            object_class,
-            one.label,
-            kind,
-            exists,
-            caught.map(lambda c: len(c.points[one.instance_id])),
-            caught.map(lambda c: int(c.n_changed[one.instance_id])),
-            Pair(
-                visible_share(exists.before, sensors.before, casters.before, drives.before, scenes.before),
-                visible_share(exists.after, sensors.after, casters.after, drives.after, scenes.after),
-            ),
-            one.edit,
-            one.note,
-            _centre(points, T_map_street),
-            one.partner if isinstance(one, Item) else None,
-        )
-        return replace(instance, excluded=_reason_to_exclude(instance, options))
-
-    things = [
-        instance_of(i, i.placed.thing.kind, i.object_class, Pair(i.before is not None, i.after is not None))
-        for i in items
-    ]
-    patches = [instance_of(g, "ground", ObjectClass.GROUND, Pair(True, True)) for g in grounds]
-    return sorted(things + patches, key=lambda instance: instance.instance_id)
-
-
-class _Caught(NamedTuple):
-    """What one survey caught of each instance: its returns (street's frame, m), and how many lie on changed surface."""
-
-    points: list[FloatArray]
-    n_changed: Int64Array
-
-
-def _caught(scene: EpochScene, measured: Scan, change: ByteArray, n_ids: int) -> _Caught:
-    owner = scene.owner[measured.primitive]
-    order = np.argsort(owner, kind="stable")
-    bounds = np.searchsorted(owner[order], np.arange(1, n_ids))
-    n_changed = np.bincount(owner[change != ChangeLabel.UNCHANGED], minlength=n_ids)
-    return _Caught(np.split(measured.xyz[order], bounds), n_changed)
-
-
-def _share(is_true: BoolArray) -> float:
-    return round(float(is_true.mean()), 3) if len(is_true) else 0.0
-
-
-def _centre(points: FloatArray, T_map_street: FloatArray) -> tuple[float, float, float] | None:
-    if not len(points):
-        return None
-    x, y, z = np.round(transform_points(T_map_street, points.mean(axis=0)[None])[0], 3).tolist()
-    return x, y, z
-
-
-def _reason_to_exclude(instance: TruthInstance, options: SimulationOptions) -> str | None:
-    """Why an instance cannot be judged from these two surveys; None where it can."""
-    for epoch in ("before", "after"):
-        n, least = getattr(instance.n_points, epoch), options.min_returns
-        if getattr(instance.exists, epoch) and n < least:
-            return f"{n} returns in the {epoch} survey, fewer than {least}"
-        seen = getattr(instance.visible, epoch)
-        if seen is not None and seen < options.min_visible:
-            share, least_share = 100 * seen, 100 * options.min_visible
-            return f"the {epoch} survey could see {share:.0f} % of its place, less than {least_share:.0f} %"
-    changed = instance.n_changed.before + instance.n_changed.after
-    if instance.is_changed and changed < options.min_returns:
-        return f"{changed} returns from what changed, fewer than {options.min_returns}"
-    return None

@@ -85,6 +85,35 @@ class Annex:
 
 
 @dataclass(frozen=True)
+class Dormer:
+    """A dormer in the front slope of a roof whose ridge lies along the street: middle, width and height (m)."""
+
+    x: float
+    width: float = 1.8
+    height: float = 1.3
+
+    def surface(self, eaves_m: float, slope: float) -> Shape:
+        """Cheeks, a flat roof, and a window in front, on a slope that rises from the eaves at y = 0."""
+        half, front = self.width / 2, 0.7
+        foot = eaves_m + front * slope
+        back = front + self.height / slope + 0.2
+        pane = Opening(0.2, 0.45, self.width - 0.4, self.height - 0.3, 0.06)
+        return joined(
+            [
+                wall((self.x - half, front, foot - 0.3), (1, 0, 0), self.width, self.height + 0.3, [pane]),
+                wall((self.x + half, front, foot), (0, 1, 0), back - front, self.height),
+                wall((self.x - half, back, foot), (0, -1, 0), back - front, self.height),
+                box(
+                    (self.x - half - 0.1, front - 0.15, foot + self.height),
+                    (self.x + half + 0.1, back, foot + self.height + 0.15),
+                    Material.BITUMEN,
+                    has_bottom=True,
+                ),
+            ]
+        )
+
+
+@dataclass(frozen=True)
 class House:
     """A house whose front stands on y = 0 and faces the road (-y).
 
@@ -100,6 +129,7 @@ class House:
     bays: int = 2
     has_chimney: bool = True
     annexes: tuple[Annex, ...] = ()
+    dormers: tuple[Dormer, ...] = ()
     object_class: ObjectClass = ObjectClass.BUILDING
 
     @property
@@ -116,7 +146,8 @@ class House:
         parts += [self._foundation(), self._roof(), *(annex.surface() for annex in self.annexes)]
         if self.has_chimney and self.roof != "flat":
             parts.append(self._chimney())
-        return joined(parts)
+        slope = float(np.tan(np.radians(self.pitch_deg)))
+        return joined([*parts, *(dormer.surface(self.eaves_m, slope) for dormer in self.dormers)])
 
     def _foundation(self) -> Shape:
         w = self.width / 2
@@ -458,6 +489,32 @@ CAR_STYLES = {
             (1.0, 0.56, 0.95),
         ),
     ),
+    "lorry": CarStyle(
+        5.60,
+        2.20,
+        2.95,
+        (
+            (0.0, 0.3, 0.3),
+            (0.01, 0.38, 0.8),
+            (0.2, 0.38, 0.82),
+            (0.23, 0.38, 1.0),
+            (0.98, 0.38, 1.0),
+            (1.0, 0.38, 0.99),
+        ),
+    ),
+    "caravan": CarStyle(
+        5.10,
+        2.15,
+        2.55,
+        (
+            (0.0, 0.2, 0.2),
+            (0.14, 0.24, 0.24),
+            (0.16, 0.4, 0.8),
+            (0.26, 0.42, 0.98),
+            (0.9, 0.42, 1.0),
+            (1.0, 0.4, 0.85),
+        ),
+    ),
 }
 """Vehicles by name."""
 
@@ -478,7 +535,7 @@ class Car:
         style = CAR_STYLES[self.style]
         paint = Material.DARK_PAINT if self.is_dark else Material.LIGHT_PAINT
         rings = np.array([self._ring(style, *station) for station in style.profile])
-        glass = Material.GLASS if self.style != "van" else paint
+        glass = Material.GLASS if style.height < 2.0 else paint
         # strips between the corners of a ring: sill, flank, window, roof, window, flank, floor
         body = loft(rings, [paint, paint, glass, paint, glass, paint, paint, Material.RUBBER])
         ends = [

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from loda_pdal.benchmark.simulate.raycast import RayCaster, normals_of
 from loda_pdal.benchmark.simulate.scene import Ground
-from loda_pdal.benchmark.simulate.shapes import REFLECTANCE, RETURN_SHARE, Shape
-from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array
+from loda_pdal.benchmark.simulate.shapes import REFLECTANCE, RETURN_SHARE, Material, windows_at
+from loda_pdal.benchmark.simulate.world import World
+from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, Int64Array
 from loda_pdal.model.transform import rotation_matrix
 
 GRAZING_COSINE = 0.06
@@ -29,6 +29,10 @@ class Scanner(Protocol):
 
     @property
     def dropout(self) -> float: ...
+
+    @property
+    def max_returns(self) -> int:
+        """How many returns of a pulse are recorded."""
 
     @property
     def bright_range_m(self) -> float:
@@ -62,6 +66,7 @@ class Sensor:
     drift_deg: float = 0.03
     column_share: float = 0.018
     bright_range_m: float = 40.0
+    max_returns: int = 1
 
     def directions(self, path: Drive, columns: Int64Array) -> FloatArray:
         """All beams of columns of the drive."""
@@ -108,18 +113,91 @@ class Scan(NamedTuple):
     ----------
     xyz : (n, 3) float64, m
         As reported, with range noise and pose error, in the street's frame.
+    met_xyz : (n, 3) float64, m
+        Where the pulse truly met the surface; what returns from behind a pane met the pane.
     primitive : (n,) int64
         Which primitive of the scene was hit.
     time : (n,) float64, s
         Since the survey began.
     intensity : (n,) uint16
         Strength of the return.
+    return_number, n_returns : (n,) uint8
+        The how manieth return of its pulse it is, from 1, and of how many.
     """
 
     xyz: FloatArray
+    met_xyz: FloatArray
     primitive: Int64Array
     time: FloatArray
     intensity: npt.NDArray[np.uint16]
+    return_number: ByteArray
+    n_returns: ByteArray
+
+    def chosen(self, is_kept: BoolArray) -> Scan:
+        """Those of the returns that ``is_kept`` (n,) says."""
+        parts: list[Any] = [part[is_kept] for part in self]
+        return Scan(*parts)
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """How the world sends light back on the day of a survey.
+
+    Attributes
+    ----------
+    is_glazed : bool
+        Facades have windows, and part of what returns from glass comes from behind it.
+    is_wet : bool
+        Roads, pavements and flat roofs are dark, and puddles on them return nothing.
+    puddles : tuple of float
+        Phases (rad) of the waves whose crests are puddles.
+    weakest_signal : float
+        Share of the light, range and incidence allowed for, of which half of the returns get lost.
+    """
+
+    is_glazed: bool = False
+    is_wet: bool = False
+    puddles: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    weakest_signal: float = 0.0
+
+    @property
+    def reflectance(self) -> FloatArray:
+        """Share of the light that each `Material` sends back."""
+        share = REFLECTANCE.copy()
+        if self.is_wet:
+            share[list(_WETTED)] *= 0.4
+        return share
+
+    @property
+    def behind_share(self) -> float:
+        """Share of the returns from glass that come from behind it."""
+        return _BEHIND_SHARE if self.is_glazed else 0.0
+
+    def detected(self, signal: FloatArray) -> FloatArray:
+        """Share of returns of strength ``signal`` (n,) that are strong enough."""
+        power = signal**2
+        return np.asarray(power / np.maximum(power + self.weakest_signal**2, 1e-30))
+
+    def material_at(self, material: ByteArray, at: FloatArray, normals: FloatArray) -> ByteArray:
+        """`Material` at places (n, 3) m of surfaces of ``material`` (n,): glass in the windows of facades."""
+        is_pane = np.zeros(len(material), dtype=bool)
+        if self.is_glazed:
+            is_facade = material == Material.FACADE
+            is_pane[is_facade] = windows_at(at[is_facade], normals[is_facade])
+        return np.where(is_pane, np.uint8(Material.GLASS), material)
+
+    def is_mirror(self, material: ByteArray, at: FloatArray, normals: FloatArray) -> BoolArray:
+        """Which places (n, 3) m lie in a puddle, (n,)."""
+        if not self.is_wet:
+            return np.zeros(len(at), dtype=bool)
+        x, y = at[:, 0], at[:, 1]
+        a, b, c = self.puddles
+        wave = np.sin(1.5 * x + 0.4 * y + a) + np.sin(0.9 * y - 0.5 * x + b) + np.sin(0.7 * x + 1.1 * y + c)
+        return np.asarray((wave > 1.7) & (np.abs(normals[:, 2]) > 0.95) & np.isin(material, _WETTED))
+
+
+_WETTED = (Material.ASPHALT, Material.PAVING, Material.BITUMEN, Material.CONCRETE)
+"""Materials that rain makes dark, and on which it stands."""
 
 
 def drive(
@@ -163,55 +241,126 @@ def _wander(time: FloatArray, rms: float, random: np.random.Generator) -> FloatA
     return np.asarray(rms * (total - total.mean(axis=0)))
 
 
-def scan(sensor: Scanner, scene: Shape, path: Drive, random: np.random.Generator) -> Scan:
-    """What the sensor reports of ``scene`` along ``path``."""
-    caster, normals = RayCaster(scene), normals_of(scene)
+def scan(
+    sensor: Scanner, world: World, path: Drive, random: np.random.Generator, conditions: Conditions | None = None
+) -> Scan:
+    """What the sensor reports of ``world`` along ``path``; in dry weather and without windows where not told."""
     columns = np.arange(len(path.time))
+    behind = random.spawn(1)[0]  # of its own, so that a first return does not depend on what lies behind it
     parts = [
-        _scan_columns(sensor, scene, caster, normals, path, columns[start : start + _COLUMNS_AT_ONCE], random)
+        _scan_columns(
+            sensor, world, path, columns[start : start + _COLUMNS_AT_ONCE], random, behind, conditions or Conditions()
+        )
         for start in range(0, max(len(columns), 1), _COLUMNS_AT_ONCE)
     ]
-    xyz, primitive, time, intensity = zip(*parts, strict=True)
-    return Scan(np.concatenate(xyz), np.concatenate(primitive), np.concatenate(time), np.concatenate(intensity))
+    return Scan(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
 _COLUMNS_AT_ONCE = 8192
 """Columns whose rays are held in memory together."""
 
+_ROOM_DEPTH_M = 1.5
+"""Mean distance from a pane to what a pulse that passed it meets inside."""
+
+_BEHIND_SHARE = 0.6
+"""Share of the returns from a window that come from behind the pane."""
+
+_LEAF_THICKNESS_M = 0.35
+"""How far behind a leaf the next return of the same pulse can lie."""
+
+_THROUGH_SHARE = 0.55
+"""Share of pulses that meet a leaf with only part of their width and go on."""
+
 
 def _scan_columns(
     sensor: Scanner,
-    scene: Shape,
-    caster: RayCaster,
-    normals: FloatArray,
+    world: World,
     path: Drive,
     columns: Int64Array,
     random: np.random.Generator,
+    behind: np.random.Generator,
+    conditions: Conditions,
 ) -> Scan:
-    """Returns of some columns of the drive."""
+    """Returns of some columns of the drive, in the order of the pulses."""
     directions = sensor.directions(path, columns)
     column = np.repeat(columns, len(directions) // len(columns) if len(columns) else 0)
-    hits = caster.cast(path.position[column], directions, sensor.max_range_m)
-    noise = random.normal(0.0, sensor.noise_m, len(column))
-    luck, speckle = random.random(len(column)), random.normal(1.0, 0.08, len(column))
+    pulse, start_m = np.arange(len(column)), np.zeros(len(column))
+    echoes = []
+    for number in range(1, sensor.max_returns + 1):
+        own = random if number == 1 else behind
+        origins = path.position[column[pulse]] + start_m[:, None] * directions[pulse]
+        hits = world.cast(origins, directions[pulse], path.time[column[pulse]], sensor.max_range_m - start_m)
+        noise = own.normal(0.0, sensor.noise_m, len(pulse))
+        luck, speckle = own.random(len(pulse)), own.normal(1.0, 0.08, len(pulse))
 
-    hit = np.flatnonzero(hits.primitive >= 0)
-    cosine = np.abs(np.sum(normals[hits.primitive[hit]] * directions[hit], axis=1))
-    share = RETURN_SHARE[scene.material[hits.primitive[hit]]] * (1.0 - sensor.dropout)
-    is_returned = luck[hit] < share * np.clip(cosine / GRAZING_COSINE, 0.0, 1.0)
-    kept, cosine = hit[is_returned], cosine[is_returned]
-
-    pose, range_m, primitive = column[kept], hits.range_m[kept], hits.primitive[kept].astype(np.int64)
-    measured = directions[kept] * (range_m + noise[kept])[:, None]
+        hit = np.flatnonzero(hits.primitive >= 0)
+        at = origins[hit] + hits.range_m[hit, None] * directions[pulse[hit]]
+        normal = world.normals[hits.primitive[hit]]
+        material = conditions.material_at(world.material[hits.primitive[hit]], at, normal)
+        cosine = np.abs(np.sum(normal * directions[pulse[hit]], axis=1))
+        range_m = start_m[hit] + hits.range_m[hit]
+        signal = conditions.reflectance[material] * cosine / (1.0 + (range_m / sensor.bright_range_m) ** 2)
+        share = RETURN_SHARE[material] * (1.0 - sensor.dropout) * np.clip(cosine / GRAZING_COSINE, 0.0, 1.0)
+        share *= conditions.detected(signal) * ~conditions.is_mirror(material, at, normal)
+        kept = luck[hit] < share
+        is_behind = kept & (material == Material.GLASS) & (behind.random(len(hit)) < conditions.behind_share)
+        range_m[is_behind] += _depth_behind(
+            world, at[is_behind], directions[pulse[hit[is_behind]]], path.time[column[pulse[hit[is_behind]]]], behind
+        )
+        echoes.append(
+            _Echoes(
+                pulse[hit[kept]],
+                at[kept],
+                (range_m + noise[hit])[kept],
+                hits.primitive[hit[kept]].astype(np.int64),
+                np.clip(60000.0 * signal * speckle[hit], 1, 65535)[kept].astype(np.uint16),
+            )
+        )
+        is_through = (world.material[hits.primitive[hit]] == Material.LEAF) & (behind.random(len(hit)) < _THROUGH_SHARE)
+        pulse, start_m = pulse[hit[is_through]], range_m[is_through] + _LEAF_THICKNESS_M
+    found = _in_order(echoes)
+    return_number, n_returns = _numbered(found.pulse)
+    pose = column[found.pulse]
+    measured = directions[found.pulse] * found.range_m[:, None]
     xyz = path.recorded[pose] + measured + np.cross(path.turn[pose], measured)
-    brightness = REFLECTANCE[scene.material[primitive]] * cosine / (1.0 + (range_m / sensor.bright_range_m) ** 2)
-    intensity = np.clip(60000.0 * brightness * speckle[kept], 1, 65535).astype(np.uint16)
-    return Scan(xyz, primitive, path.time[pose], intensity)
+    return Scan(xyz, found.met_xyz, found.primitive, path.time[pose], found.intensity, return_number, n_returns)
+
+
+class _Echoes(NamedTuple):
+    """Returns of pulses: which pulse, where it met the surface, its range (m), which primitive, how bright."""
+
+    pulse: Int64Array
+    met_xyz: FloatArray
+    range_m: FloatArray
+    primitive: Int64Array
+    intensity: npt.NDArray[np.uint16]
+
+
+def _in_order(echoes: list[_Echoes]) -> _Echoes:
+    """All returns in the order of their pulses, near ones first."""
+    joined: list[Any] = [np.concatenate(part) for part in zip(*echoes, strict=True)]
+    order = np.argsort(joined[0], kind="stable")
+    return _Echoes(*(part[order] for part in joined))
+
+
+def _depth_behind(
+    world: World, at: FloatArray, directions: FloatArray, time: FloatArray, random: np.random.Generator
+) -> FloatArray:
+    """How far behind a pane pulses that passed it end, (n,) m: at something in the room, at the latest at its wall."""
+    gap = 0.05
+    depth = random.exponential(_ROOM_DEPTH_M, len(at))
+    return gap + world.cast(at + gap * directions, directions, time, depth + 1.0).range_m.clip(max=depth)
+
+
+def _numbered(pulse: Int64Array) -> tuple[ByteArray, ByteArray]:
+    """For each return of ascending ``pulse`` (n,), the how manieth of its pulse it is, and of how many."""
+    _, first, place, n = np.unique(pulse, return_index=True, return_inverse=True, return_counts=True)
+    return (np.arange(len(pulse)) - first[place] + 1).astype(np.uint8), n[place].astype(np.uint8)
 
 
 def sees(
     sensor: Scanner,
-    caster: RayCaster,
+    world: World,
     path: Drive,
     targets: FloatArray,
     see_through: BoolArray,
@@ -232,7 +381,8 @@ def sees(
     directions = offset / np.maximum(distance, 1e-9)[:, None]
     is_in_view = sensor.can_look(directions, np.repeat(path.heading[station], len(targets)))
     candidate = np.flatnonzero((distance < sensor.max_range_m) & is_in_view)
-    hits = caster.cast(origins[candidate], directions[candidate], np.maximum(distance[candidate] - margin_m, 0.0))
+    time = np.repeat(path.time[station], len(targets))[candidate]
+    hits = world.cast(origins[candidate], directions[candidate], time, np.maximum(distance[candidate] - margin_m, 0.0))
     is_seen = np.zeros(len(offset), dtype=bool)
     is_seen[candidate] = (hits.primitive < 0) | see_through[hits.primitive]
     return np.asarray(is_seen.reshape(len(station), -1).any(axis=0))

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import shapely
+import shapely.ops
 
 from loda_pdal.benchmark.simulate.city_model import ModelBuilding
 from loda_pdal.benchmark.simulate.edits import (
@@ -37,6 +39,10 @@ _TRIES = 600
 _LEAST_COVER, _MOST_COVER = 0.12, 0.60
 _WALL_TOP_M = 1.5
 """Corners higher than this above the foot of a building move when a storey is put in or taken out."""
+
+
+_WALL_GAP_M = 0.1
+"""A piece of outline this near to a wall has one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +81,13 @@ class ModelHouse:
         z[z > _WALL_TOP_M] += self.lift_m
         z[z < 0.3] -= FOUNDATION_M
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        is_roof = np.abs(normal[:, 2]) > 0.2 * np.linalg.norm(normal, axis=1)
-        parts = [of_triangles(corners[is_roof], Material.ROOF_TILE), of_triangles(corners[~is_roof], Material.BRICK)]
+        rise = np.abs(normal[:, 2]) / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
+        kinds = (
+            (rise <= 0.2, Material.FACADE),
+            ((rise > 0.2) & (rise <= 0.98), Material.ROOF_TILE),
+            (rise > 0.98, Material.BITUMEN),
+        )
+        parts = [of_triangles(corners[is_kind], material) for is_kind, material in kinds]
         parts += [box(low, high, Material.CONCRETE).placed(0, 0, 0, yaw) for low, high, yaw in self.boxes]
         return joined(parts)
 
@@ -210,7 +221,30 @@ def _house(building: ModelBuilding, outline: Any, origin: FloatArray, yaw: float
     middle = outline.centroid
     corners -= (middle.x, middle.y, building.foot_m)
     own = shapely.transform(outline, lambda xy: xy - (middle.x, middle.y))
-    return Placed(ModelHouse(building.name, corners, own), middle.x, middle.y)
+    house = ModelHouse(building.name, corners, own)
+    closed = np.concatenate([corners, party_walls(house)])
+    return Placed(replace(house, triangles=closed), middle.x, middle.y)
+
+
+def party_walls(house: ModelHouse) -> FloatArray:
+    """Walls (t, 3, 3) where a model leaves them out because a neighbour stands there, m about the house's origin: along
+    every piece of its outline that has none, up to its roof."""
+    a, b = house.triangles[:, [0, 1, 2], :2], house.triangles[:, [1, 2, 0], :2]
+    edges = np.cross(house.triangles[:, 1] - house.triangles[:, 0], house.triangles[:, 2] - house.triangles[:, 0])
+    is_wall = np.abs(edges[:, 2]) < 0.1 * np.linalg.norm(edges, axis=1)
+    known = shapely.union_all(shapely.linestrings(np.stack([a[is_wall], b[is_wall]], axis=2).reshape(-1, 2, 2)))
+    pieces = house.footprint.boundary.difference(known.buffer(_WALL_GAP_M))
+    inside = house.footprint.buffer(-_WALL_GAP_M)
+    quads = []
+    for piece in getattr(pieces, "geoms", [pieces]):
+        for start, end in pairwise(shapely.segmentize(piece, 1.0).coords):
+            near = shapely.ops.nearest_points(inside, shapely.LineString([start, end]).centroid)[0]
+            top = house.roof_at(near.x, near.y)
+            if top > _WALL_TOP_M:
+                (x0, y0), (x1, y1) = start, end
+                quads.append([(x0, y0, 0.0), (x1, y1, 0.0), (x1, y1, top), (x0, y0, top)])
+    corners = np.array(quads, dtype=float).reshape(-1, 4, 3)
+    return np.stack([corners[:, (0, 1, 2)], corners[:, (0, 2, 3)]], axis=1).reshape(-1, 3, 3)
 
 
 def _is_free(town: Town, place: Any, gap_m: float) -> bool:

@@ -87,8 +87,8 @@ def _write_laz(survey: SimulatedSurvey, surveyed: date, path: Path) -> None:
     las.x, las.y, las.z = survey.xyz.T
     las.intensity = survey.intensity
     las.gps_time = survey.gps_time
-    las.return_number = np.ones(len(survey), dtype=np.uint8)
-    las.number_of_returns = np.ones(len(survey), dtype=np.uint8)
+    las.return_number = survey.return_number
+    las.number_of_returns = survey.n_returns
     las[TRUTH_ID] = survey.truth_id
     las[TRUTH_CHANGE] = survey.truth_change
     las.write(str(path))
