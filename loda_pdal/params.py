@@ -465,6 +465,12 @@ class ChangeParams(StageParams):
         low=0,
         high=100,
     )
+    thing_voxels: int = param(
+        5,
+        "occupancy voxels of the smallest thing that came or went beside what it is merged with; 0: none are looked for",
+        low=0,
+        high=10000,
+    )
     part_is_new_m3: float = param(
         16.0,
         "a part of a building that only one survey has, and as large as this, is a building that was Added or Removed",
@@ -740,6 +746,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "fills_buildings": True,
             "needs_sight": False,
             "within_share": 0.0,
+            "thing_voxels": 0,
             "part_min_voxels": 24,
             "part_is_new_m3": 80.0,
             "frontage_m": 0.0,
@@ -775,6 +782,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "min_expected_points": 0.0,
             "needs_sight": False,
             "within_share": 0.0,
+            "thing_voxels": 0,
             "replaced_m": 0.0,
         },
     },

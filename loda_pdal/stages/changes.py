@@ -22,6 +22,7 @@ from loda_pdal.stages.correspondence import rank_by_place
 from loda_pdal.stages.cues import Cells, Evidence, Surface, Voxels, cells_with_owners, sample_voxels, weigh
 from loda_pdal.stages.observability import Coverage
 from loda_pdal.stages.parts import Parts, dissolve, split_parts
+from loda_pdal.stages.things import split_things
 from loda_pdal.stages.vehicles import looks_like_vehicle, shape_change
 
 
@@ -96,6 +97,11 @@ def decide_changes(
         cast = cast.without_surroundings(is_within, voxels.at_points(cells.is_near.swapped, cast.surfaces))
         cast = cast.settled(voxels)
         cells = cast.cells(voxels, params)
+    if params.thing_voxels > 0:
+        is_asked = cast.is_pair & (cast.object_class != ObjectClass.BUILDING)
+        owner, host = split_things(cells, cast.surfaces, is_asked, params)
+        cast = cast.with_more(owner, host).settled(voxels)
+        cells = cast.cells(voxels, params)
     if params.find_parts:
         is_building = cast.object_class == ObjectClass.BUILDING
         cast = cast.with_parts(split_parts(cells, cast.surfaces, is_building, len(cast), params)).settled(voxels)
@@ -155,14 +161,8 @@ class _Cast:
     def without_pairs(self, is_no_pair: BoolArray) -> _Cast:
         """The before and the after side of the marked objects as objects of their own."""
         owner, partner = dissolve(self.surfaces.map(lambda side: side.owner), is_no_pair, len(self))
-        return _Cast(
-            self.surfaces.join(owner, Surface.owned_by),
-            np.concatenate([self.object_class, self.object_class[partner]]),
-            np.concatenate([self.parent, self.parent[partner]]),
-            np.concatenate([self.is_apart | is_no_pair, np.ones(len(partner), np.bool_)]),
-            np.concatenate([self.is_house, self.is_house[partner]]),
-            np.concatenate([self.is_extension, self.is_extension[partner]]),
-        )
+        apart = self.with_more(owner, partner)
+        return replace(apart, is_apart=apart.is_apart | is_no_pair[np.concatenate([np.arange(len(self)), partner])])
 
     def without_surroundings(self, is_within: BoolArray, is_shared: Pair[BoolArray]) -> _Cast:
         """Of the marked objects (k,) keep what both epochs show; the rest is an object of its own."""
@@ -173,14 +173,25 @@ class _Cast:
             is_shared,
             lambda side, shared: np.where(~shared & (number[side.owner] >= 0), number[side.owner], side.owner),
         )
+        return self.with_more(owner, inner)
+
+    def with_more(self, owner: Pair[IntArray], like: IntArray) -> _Cast:
+        """Other owners, and behind the objects there are as many more as ``like`` (t,) names, of their kind."""
+        each = np.concatenate([np.arange(len(self)), like])
         return _Cast(
             self.surfaces.join(owner, Surface.owned_by),
-            np.concatenate([self.object_class, self.object_class[inner]]),
-            np.concatenate([self.parent, self.parent[inner]]),
-            np.concatenate([self.is_apart, self.is_apart[inner]]),
-            np.concatenate([self.is_house, self.is_house[inner]]),
-            np.concatenate([self.is_extension, self.is_extension[inner]]),
+            self.object_class[each],
+            self.parent[each],
+            self.is_apart[each],
+            self.is_house[each],
+            self.is_extension[each],
         )
+
+    @property
+    def is_pair(self) -> BoolArray:
+        """Which objects (n,) both epochs have."""
+        before, after = (np.isin(np.arange(len(self)), side.owner) for side in self.surfaces)
+        return before & after
 
     def with_parts(self, parts: Parts) -> _Cast:
         """Parts as objects of their parents' class."""

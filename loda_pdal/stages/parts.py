@@ -54,13 +54,18 @@ class Parts:
     is_extension: BoolArray
 
 
-class _Region(NamedTuple):
-    """Connected voxels of one object: their columns, and the share of these that the other epoch's object lacks."""
+class Region(NamedTuple):
+    """Connected voxels of one object: their columns (k, 2), the voxels (m,), and the share of the columns in which the
+    other epoch has nothing of the object."""
 
     parent: int
     columns: Int64Array
-    n_voxels: int
+    voxels: Int64Array
     share_new: float
+
+    @property
+    def n_voxels(self) -> int:
+        return len(self.voxels)
 
 
 def split_parts(cells: Cells, surfaces: Pair[Surface], is_building: BoolArray, n: int, params: ChangeParams) -> Parts:
@@ -89,12 +94,14 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], is_building: BoolArray, n
     is_split = is_pair & (is_long | has_houses)
     own = cells.owner
     regions = [
-        *_regions(cells, own, cells.is_lost, is_split, params),
-        *_regions(cells, own.swapped, cells.is_gained, is_split, params),
-        *_regions(cells, own, cells.is_near.after, ~is_pair, params),
-        *_regions(cells, own.swapped, cells.is_near.before, ~is_pair, params),
+        *connected_regions(cells, own, cells.is_lost, is_split, params.part_min_voxels),
+        *connected_regions(cells, own.swapped, cells.is_gained, is_split, params.part_min_voxels),
+        *connected_regions(cells, own, cells.is_near.after, ~is_pair, params.part_min_voxels),
+        *connected_regions(cells, own.swapped, cells.is_near.before, ~is_pair, params.part_min_voxels),
     ]
-    columns, part, parent, is_house, is_extension = _claim(regions, _columns_of(cells, n), has_houses & is_pair, is_long, params)
+    columns, part, parent, is_house, is_extension = _claim(
+        regions, _columns_of(cells, n), has_houses & is_pair, is_long, params
+    )
     if len(parent) == 0:
         return Parts(owner, nobody, nothing, nothing)
     lattice = Lattice.around(columns)
@@ -132,10 +139,13 @@ def _columns_of(cells: Cells, n: int) -> tuple[Int64Array, Int64Array]:
     return rows, np.searchsorted(rows[:, 0], np.arange(n + 1))
 
 
-def _regions(
-    cells: Cells, owner: Pair[IntArray], is_in: BoolArray, is_split: BoolArray, params: ChangeParams
-) -> list[_Region]:
-    """Connected regions of the marked voxels within one object; ``owner`` of this epoch and of the other."""
+def connected_regions(
+    cells: Cells, owner: Pair[IntArray], is_in: BoolArray, is_split: BoolArray, least: int
+) -> list[Region]:
+    """Connected regions of at least ``least`` of the marked voxels (c,) within one of the objects ``is_split`` (n,).
+
+    ``owner`` (c,) of this epoch and of the other.
+    """
     members = np.flatnonzero(is_in & (owner.before >= 0) & is_split[np.maximum(owner.before, 0)])
     if len(members) == 0:
         return []
@@ -147,11 +157,11 @@ def _regions(
     groups = Groups(region, int(region.max()) + 1)
     is_shared = _in_column_of(cells, own, members, owner.after)
     found = []
-    for index in np.flatnonzero(groups.counts >= params.part_min_voxels).tolist():
+    for index in np.flatnonzero(groups.counts >= least).tolist():
         inside = groups.members(index)
         plan, first = np.unique(cells.voxels.cell[members[inside], :2], axis=0, return_index=True)
         share_new = 1.0 - float(is_shared[inside[first]].mean())
-        found.append(_Region(int(own[inside[0]]), plan, len(inside), share_new))
+        found.append(Region(int(own[inside[0]]), plan, members[inside], share_new))
     return found
 
 
@@ -173,7 +183,7 @@ def _under(region: Int64Array, columns: Int64Array, *, fills_hull: bool) -> Bool
 
 
 def _claim(
-    regions: list[_Region],
+    regions: list[Region],
     columns_of: tuple[Int64Array, Int64Array],
     has_houses: BoolArray,
     is_long: BoolArray,
@@ -188,7 +198,7 @@ def _claim(
     part_of = np.full(len(rows), -1, dtype=np.int64)
     parents: list[int] = []
     is_extension: list[bool] = []
-    in_rows: list[tuple[int, _Region]] = []
+    in_rows: list[tuple[int, Region]] = []
     for region in sorted(regions, key=lambda r: (-r.n_voxels, r.parent, r.columns[0].tolist())):
         first, last = start[region.parent], start[region.parent + 1]
         is_inside = _under(region.columns, rows[first:last, 1:], fills_hull=not params.fills_buildings)
