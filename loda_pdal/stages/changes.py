@@ -23,7 +23,7 @@ from loda_pdal.stages.cues import Cells, Evidence, Surface, Voxels, cells_with_o
 from loda_pdal.stages.observability import Coverage
 from loda_pdal.stages.parts import Parts, dissolve, split_parts
 from loda_pdal.stages.things import split_things
-from loda_pdal.stages.vehicles import looks_like_vehicle, shape_change
+from loda_pdal.stages.vehicles import looks_like_vehicle, roughness, shape_change
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,8 @@ def decide_changes(
         cast = cast.settled(voxels)
         cells = cast.cells(voxels, params)
     if params.thing_voxels > 0:
-        is_asked = cast.is_pair & (cast.object_class != ObjectClass.BUILDING)
+        is_vehicle = (cast.object_class == ObjectClass.MOBILE) & looks_like_vehicle(cast.surfaces, len(cast))
+        is_asked = cast.is_pair & (cast.object_class != ObjectClass.BUILDING) & ~is_vehicle
         owner, host = split_things(cells, cast.surfaces, is_asked, params)
         cast = cast.with_more(owner, host).settled(voxels)
         cells = cast.cells(voxels, params)
@@ -321,7 +322,12 @@ def _is_replaced(cast: _Cast, cues: list[Cue], is_open: Pair[BoolArray], params:
     is_pair = np.array([cue.is_before and cue.is_after for cue in cues], dtype=np.bool_)
     is_asked = is_pair & (cast.object_class == ObjectClass.MOBILE) & (params.replaced_m > 0)
     is_asked &= looks_like_vehicle(cast.surfaces, len(cast))
-    return np.asarray(shape_change(cast.surfaces, is_open, is_asked) > params.replaced_m)
+    off = shape_change(cast.surfaces, is_open, is_asked)
+    return np.asarray(off > np.fmax(params.replaced_m, _ROUGH * roughness(cast.surfaces, is_asked)))
+
+
+_ROUGH = 1.2
+"""A shape must be off by more than this many times its own roughness."""
 
 
 def _is_apart(cue: Cue, params: ChangeParams) -> bool:
@@ -434,8 +440,8 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
     least_above = max(least, params.backing_share * cue.n_voxels)
     has_height = params.use_height and abs(cue.dh) > max(gate, height_m)  # NaN is never above
     has_volume = params.use_volume and abs(cue.dv_ratio) > ratio
-    is_raised = least == 0 or cue.gained_above >= least_above or cue.column_rise > max(gate, height_m) / 2
-    is_lowered = least == 0 or cue.lost_above >= least_above or cue.column_rise < -max(gate, height_m) / 2
+    is_raised = least == 0 or cue.gained_above >= least_above or cue.column_rise > max(gate, height_m / 2)
+    is_lowered = least == 0 or cue.lost_above >= least_above or cue.column_rise < -max(gate, height_m / 2)
     rises = has_height and cue.dh > 0 and is_raised
     sinks = has_height and cue.dh < 0 and is_lowered
     noise = params.volume_sigmas * math.sqrt(cue.gained + cue.lost)

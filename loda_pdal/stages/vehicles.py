@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from loda_pdal.kernels.neighbours import nearest
+from loda_pdal.kernels.neighbours import knn, nearest
 from loda_pdal.model.boxes import upright_boxes
 from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array
 from loda_pdal.model.groups import Groups, count_cells
@@ -36,6 +36,7 @@ _LEAST_M = (1.2, 2.2, 1.1)
 
 _LEAST_FILL = 0.6
 _CELL_M = 0.5
+_NEIGHBOURS = 4
 _MIN_POINTS = 30
 _APART_M = 100.0
 """Vehicles are lifted so far from each other that none sees another: one search serves them all."""
@@ -82,6 +83,24 @@ def shape_change(surfaces: Pair[Surface], is_open: Pair[BoolArray], is_asked: Bo
         len(is_asked),
     )
     return np.fmin(before, after)
+
+
+def roughness(surfaces: Pair[Surface], is_asked: BoolArray) -> FloatArray:
+    """Upper quartile (n,) m of the distances of an object's points from the planes of their neighbours, in the rougher
+    epoch; NaN where not asked for: foliage lies that far from itself, and so do noisy surveys."""
+    n = len(is_asked)
+    rough = [np.full(n, np.nan)]
+    for side in surfaces:
+        members = np.flatnonzero(np.append(is_asked, False)[side.owner])
+        if len(members) < 2:
+            continue
+        xyz, normals = side.xyz[members], side.normals[members].astype(np.float64)
+        neighbour = knn(xyz, _NEIGHBOURS, _REACH_M).idx
+        offset = xyz[neighbour] - xyz[:, None, :]
+        across = np.abs(np.einsum("ijk,ijk->ij", normals[neighbour], offset))
+        label = np.where(neighbour >= 0, side.owner[members][:, None], -1)
+        rough.append(Groups(label.ravel(), n).quantile(across.ravel(), 0.75))
+    return np.asarray(np.fmax.reduce(rough))
 
 
 def looks_like_vehicle(surfaces: Pair[Surface], n: int) -> BoolArray:
