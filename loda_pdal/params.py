@@ -451,6 +451,11 @@ class ChangeParams(StageParams):
         low=0,
         high=1000,
     )
+    weighs_sampling: bool = param(
+        False,
+        "gained and lost voxels count by the odds that the other survey's points would have met them: a crown sampled "
+        "more densely fills more voxels and has not grown",
+    )
     needs_sight: bool = param(
         True,
         "what is solid is gained or lost only where the other survey shows something beneath it and nothing of the same "
@@ -531,7 +536,7 @@ class ChangeParams(StageParams):
 
     def for_bodies(self) -> ChangeParams:
         """The parameters for buildings that are filled."""
-        return replace(self, voxel_m=self.body_voxel_m, query_radius_m=self.body_query_radius_m)
+        return replace(self, voxel_m=self.body_voxel_m, query_radius_m=self.body_query_radius_m, weighs_sampling=False)
 
 
 @dataclass(frozen=True)
@@ -795,6 +800,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "min_samples": 20,
             "min_expected_points": 0.0,
             "volume_sigmas": 3.0,
+            "weighs_sampling": True,
             "backing_voxels": 4,
             "vegetation_height_m": 0.8,
             "fills_buildings": True,

@@ -488,6 +488,11 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
     is_lowered = least == 0 or cue.lost_above >= least_above or cue.column_rise < -max(gate, height_m / 2)
     rises = has_height and dh > 0 and is_raised
     sinks = has_height and dh < 0 and is_lowered
+    if params.fills_buildings and cue.object_class == ObjectClass.BUILDING:
+        # edges of roofs come and go with the sampling: a body changed where a piece of it did, or most of its roof
+        is_solid = max(cue.grown_m3, cue.cut_m3) > 0
+        has_volume &= is_solid
+        has_height &= is_solid or abs(cue.column_rise) > max(gate, height_m)
     noise = params.volume_sigmas * math.sqrt(cue.gained + cue.lost)
     has_volume = has_volume and abs(cue.gained - cue.lost) >= noise
     swells = has_volume and cue.dv_ratio > 0 and (least == 0 or cue.gained >= max(least, cue.lost))

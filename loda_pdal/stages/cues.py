@@ -157,12 +157,15 @@ class Cells:
         it must show something beneath the voxel, and nothing of the same object above it.
     is_measured : Pair of (c,) bool
         Whether that epoch's owner has raw points there: not in what was filled in beneath a roof.
+    odds : Pair of (c,) float64
+        How likely that epoch's sampling was to meet what the other epoch shows there; 1 where that is not weighed.
     """
 
     voxels: Voxels
     owner: Pair[IntArray]
     is_seen: Pair[BoolArray]
     is_measured: Pair[BoolArray]
+    odds: Pair[FloatArray]
 
     @property
     def is_near(self) -> Pair[BoolArray]:
@@ -313,9 +316,10 @@ def cells_with_owners(
     holder, points = voxels.holders(surfaces, n)
     owner, n_raw = (Pair(*np.ascontiguousarray(values.T)) for values in (holder, points))
     is_seen = voxels.is_covered
+    expected = _expected_points(owner, n_raw, n)
     if params.min_expected_points > 0:
-        expected = _expected_points(owner, n_raw, n)
         is_seen = is_seen.join(expected, lambda seen, points: seen & (points >= params.min_expected_points))
+    odds = expected.map(lambda points: 1.0 - np.exp(-points) if params.weighs_sampling else np.ones(len(points)))
     if is_solid is not None and is_solid.any():
         own = Pair(owner.after, owner.before)  # what each epoch should have seen is the other's
         is_hidden = Pair(
@@ -324,7 +328,7 @@ def cells_with_owners(
         )
         solid = own.map(lambda side: np.append(is_solid, False)[side])
         is_seen = is_seen.join(solid.join(is_hidden, np.logical_and), lambda seen, hidden: seen & ~hidden)
-    return Cells(voxels, owner, is_seen, n_raw.map(lambda points: points > 0))
+    return Cells(voxels, owner, is_seen, n_raw.map(lambda points: points > 0), odds)
 
 
 def _is_over(centre: FloatArray, cell: Int64Array, columns: Int64Array, xyz: FloatArray, voxel_m: float) -> BoolArray:
@@ -401,7 +405,8 @@ def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -
         _count(own.before, cells.is_measured.before & cells.is_near.after, n),
         _count(own.after, cells.is_measured.after & cells.is_near.before, n),
     )
-    gained, lost = _count(own.after, cells.is_gained, n), _count(own.before, cells.is_lost, n)
+    gained = _count(own.after, cells.is_gained, n, cells.odds.before)
+    lost = _count(own.before, cells.is_lost, n, cells.odds.after)
     voxel, owner = _either(cells)
     compared = n_known if params.visible_only else n_voxels
     volume = compared.map(lambda count: count * params.voxel_m**3)
@@ -441,8 +446,8 @@ def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -
         dv_ratio=np.divide(dv, base, out=np.full(n, np.nan), where=base > 0),
         d_perp=np.where(is_sampled, samples.median(displacement), np.nan),
         d_typical=np.where(is_sampled, samples.median(np.abs(displacement)), np.nan),
-        gained_above=_count(own.after, cells.is_gained & _is_above(z, own.after, summit.before), n),
-        lost_above=_count(own.before, cells.is_lost & _is_above(z, own.before, summit.after), n),
+        gained_above=_count(own.after, cells.is_gained & _is_above(z, own.after, summit.before), n, cells.odds.before),
+        lost_above=_count(own.before, cells.is_lost & _is_above(z, own.before, summit.after), n, cells.odds.after),
         column_rise=_column_rise(voxels, surfaces, n),
         lod95=Groups(owner, n).median(voxels.lod95[voxel]),
         observability=(n_known.before + n_known.after) / np.maximum(n_voxels.before + n_voxels.after, 1),
@@ -450,9 +455,10 @@ def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -
     )
 
 
-def _count(owner: IntArray, is_counted: BoolArray, n: int) -> FloatArray:
-    """Voxels per object (n,) among those counted; voxels without an owner do not count."""
-    return np.bincount(owner[is_counted & (owner >= 0)], minlength=n).astype(np.float64)
+def _count(owner: IntArray, is_counted: BoolArray, n: int, odds: FloatArray | None = None) -> FloatArray:
+    """Voxels per object (n,) among those counted, each by its odds; voxels without an owner do not count."""
+    is_in = is_counted & (owner >= 0)
+    return np.bincount(owner[is_in], weights=None if odds is None else odds[is_in], minlength=n).astype(np.float64)
 
 
 def _either(cells: Cells) -> tuple[Int64Array, IntArray]:
