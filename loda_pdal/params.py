@@ -772,7 +772,6 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
         "adapts_to_spacing": True,
         "fuse": {"leaf_m": 0.5},
         "outliers": {"keep_voxels": 0},
-        "association": {"splits_merged": False},
         "normals": {"radius_m": 1.5},
         "icp": {"leaves_m": (2.0, 1.0, 0.5), "radii_m": (3.0, 1.5, 0.75)},
         "ground": {"max_object_m": 60.0, "min_voxels": 4},
