@@ -472,6 +472,13 @@ class ChangeParams(StageParams):
         low=0,
         high=10,
     )
+    replaced_top_m: float = param(
+        0.0,
+        "difference of the tops that makes a parked vehicle another one, where too few points show its shape; 0: never",
+        unit="m",
+        low=0,
+        high=10,
+    )
     find_parts: bool = param(True, "a change confined to a part becomes its own object (METHOD 2b)")
     part_of_length_m: float = param(
         15.0, "only objects longer than this are looked through for parts", unit="m", low=0, high=1000
@@ -546,7 +553,7 @@ class GroundChangeParams(StageParams):
     cell_m: float = param(2.0, "edge of a raster tile", unit="m", low=0.5, high=50, is_length=True)
     min_dz_m: float = param(0.15, "smallest elevation change", unit="m", low=0, high=10)
     lod_factor: float = param(1.1, "the change must exceed this many LoD95", low=0, high=10)
-    min_area_m2: float = param(25.0, "connected area that is reported", unit="m2", low=0, high=100000)
+    min_area_m2: float = param(12.0, "connected area that is reported", unit="m2", low=0, high=100000)
 
 
 @dataclass(frozen=True)
@@ -800,6 +807,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "min_expected_points": 0.0,
             "volume_sigmas": 3.0,
             "weighs_sampling": True,
+            "replaced_top_m": 0.2,
             "backing_voxels": 4,
             "vegetation_height_m": 0.8,
             "fills_buildings": True,
@@ -831,6 +839,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
         },
         "instances": {"join_by_footprint": False, "splits_crowns": False},
         "observability": {"is_enabled": False},
+        "ground_changes": {"min_area_m2": 25.0},
         "changes": {
             "visible_only": False,
             "find_parts": False,

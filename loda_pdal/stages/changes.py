@@ -346,7 +346,12 @@ def _is_replaced(cast: _Cast, cues: list[Cue], is_open: Pair[BoolArray], params:
     is_asked = is_pair & (cast.object_class == ObjectClass.MOBILE) & (params.replaced_m > 0)
     is_asked &= looks_like_vehicle(cast.surfaces, len(cast))
     off = shape_change(cast.surfaces, is_open, is_asked)
-    return np.asarray(off > np.fmax(params.replaced_m, _ROUGH * roughness(cast.surfaces, is_asked)))
+    is_another = off > np.fmax(params.replaced_m, _ROUGH * roughness(cast.surfaces, is_asked))
+    if params.replaced_top_m > 0:
+        rise = np.array([abs(cue.dh) for cue in cues])
+        is_mobile = is_pair & (cast.object_class == ObjectClass.MOBILE)
+        is_another |= is_mobile & np.isnan(off) & (rise > params.replaced_top_m)
+    return np.asarray(is_another)
 
 
 _ROUGH = 1.2
