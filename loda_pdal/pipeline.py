@@ -52,7 +52,8 @@ from loda_pdal.stages.superpoints import Superpoints, superpoints
 
 Progress = Callable[[int, int, str], None]
 
-_NO_SIGHT: Pair[Sight | None] = Pair(None, None)
+NO_SIGHT: Pair[Sight | None] = Pair(None, None)
+"""The rays of surveys without trajectories."""
 
 STEPS = {
     "fuse": "fusing points",
@@ -114,7 +115,7 @@ def detect_changes(
         objects = match_objects(clouds, ground, instances, proxies, p)
     with clock("changes"):
         sight = look(surveys, fused, registration, p)
-        changes = label_objects(clouds, ground, segments, instances, objects, lod, p, sight)
+        changes = label_objects(clouds, ground, segments, instances, objects, lod, sight, p)
     with clock("ground_changes"):
         ground_change = compare_ground(clouds, instances, lod, p)
     with clock("result"):
@@ -271,8 +272,8 @@ def label_objects(
     instances: Pair[Instances],
     objects: Objects,
     lod: LodGrid,
+    sight: Pair[Sight | None],
     p: Parameters,
-    sight: Pair[Sight | None] = _NO_SIGHT,
 ) -> Changes:
     """Cues and change labels (section 4.3); ``sight`` has the rays of epochs whose trajectory is known."""
     owner = instances.join(objects.of_instance, owners)

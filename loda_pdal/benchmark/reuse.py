@@ -55,7 +55,7 @@ class Runs:
         instances = step(pipeline.segment_instances, clouds, ground, classes)
         objects = step(pipeline.match_objects, clouds, ground, instances, proxies)
         sight = step(pipeline.look, surveys, fused, registration)
-        changes = step(_label_objects, clouds, ground, segments, instances, objects, lod, sight)
+        changes = step(pipeline.label_objects, clouds, ground, segments, instances, objects, lod, sight)
         ground_change = step(pipeline.compare_ground, clouds, instances, lod)
         if self._first is None:
             self._first = done
@@ -66,12 +66,6 @@ class Runs:
 
 def _into_frame(fused: Any, registration: Any, p: Any) -> Any:
     return pipeline.into_frame(fused, registration)
-
-
-def _label_objects(*inputs: Any) -> Any:
-    *found, sight, p = inputs
-    label: Callable[..., Any] = pipeline.label_objects
-    return label(*found, p, sight)
 
 
 class _Watched:

@@ -52,7 +52,8 @@ def crossed_range(start, stop, origin, target, margin, reach, edge, cell, low, s
         if length <= margin:
             continue
         d /= length
-        t_low, t_high = _between(o[2], d[2], low[2], low[2] + span[2], edge, 0.0, length + reach)
+        end = length + reach if d[2] < 0.0 else length
+        t_low, t_high = _between(o[2], d[2], low[2], low[2] + span[2], edge, 0.0, end)
         t_low, t_high = _between(o[1], d[1], low[1], low[1] + span[1], edge, t_low, t_high)
         t_low, t_high = _between(o[0], d[0], low[0] + start, low[0] + stop, edge, t_low, t_high)
         if t_low >= t_high:
@@ -77,7 +78,7 @@ def crossed_range(start, stop, origin, target, margin, reach, edge, cell, low, s
                     if z_low < z_high:
                         if z_high <= length - margin:
                             passed[v] += 1
-                        elif z_low >= length + margin and d[2] < 0.0:
+                        elif z_low >= length + margin:
                             hidden[v] += 1
                     v += 1
 
