@@ -389,10 +389,17 @@ class ObservabilityParams(StageParams):
         5.0, "returns of a fused point from so much of the way are one ray", unit="m", low=0.1, high=1000
     )
     ray_margin_m: float = param(
-        0.5, "a ray says nothing so close before and behind its return", unit="m", low=0.1, high=10, is_length=True
+        0.5, "a ray did not pass what lies so close before its return", unit="m", low=0.1, high=10, is_length=True
     )
-    shadow_m: float = param(
-        30.0, "behind its return a ray is followed so far: what it meets is hidden", unit="m", low=0.1, high=1000
+    shadow_from_m: float = param(
+        2.0,
+        "nearer behind a return it is the thing that was hit: what stood there is gone, not hidden",
+        unit="m",
+        low=0.1,
+        high=1000,
+    )
+    shadow_to_m: float = param(
+        30.0, "what a ray meets up to so far behind its return is hidden", unit="m", low=0.1, high=1000
     )
 
 

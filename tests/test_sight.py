@@ -38,7 +38,19 @@ def kernel(origin: FloatArray, target: FloatArray, cell: Int64Array, min_size: i
     found = Pair(np.zeros(len(cell), np.int32), np.zeros(len(cell), np.int32))
     n_rows = int(lattice.span[0])
     run_ranges(
-        crossed_range, n_rows, origin, target, 0.5, 4.0, 0.5, cell, lattice.low, lattice.span, *found, min_size=min_size
+        crossed_range,
+        n_rows,
+        origin,
+        target,
+        0.5,
+        1.0,
+        4.0,
+        0.5,
+        cell,
+        lattice.low,
+        lattice.span,
+        *found,
+        min_size=min_size,
     )
     return found
 
@@ -54,21 +66,21 @@ def test_rays_cross_what_the_slow_twin_says() -> None:
     target[5:10, 2] = origin[5:10, 2]  # level
     target[10:13, 0] = origin[10:13, 0]
     target[13] = origin[13]  # no ray at all
-    passed, hidden = crossed(origin, target, 0.5, 4.0, 0.5, some_voxels())
+    passed, hidden = crossed(origin, target, 0.5, 1.0, 4.0, 0.5, some_voxels())
     found = kernel(origin, target, some_voxels())
     assert found.before.tolist() == passed.tolist()
     assert found.after.tolist() == hidden.tolist()
     assert passed.sum() > 100
-    assert hidden.sum() >= 20
+    assert hidden.sum() > 10
 
 
 def test_one_ray_by_hand() -> None:
     cell = np.array([[k, 0, 0] for k in range(10)])  # voxels along x, from 0 to 5 m
     origin, target = np.array([[-1.0, 0.25, 0.26]]), np.array([[2.6, 0.25, 0.24]])
     found = kernel(origin, target, cell)
-    # left by 2.0 m, half a metre before the return; entered from 3.1 m on, half a metre behind it
+    # left by 2.0 m, half a metre before the return; entered from 3.6 m on, a metre behind it
     assert found.before.tolist() == [1, 1, 1, 1, 0, 0, 0, 0, 0, 0]
-    assert found.after.tolist() == [0, 0, 0, 0, 0, 0, 0, 1, 1, 1]
+    assert found.after.tolist() == [0, 0, 0, 0, 0, 0, 0, 0, 1, 1]
     upwards = kernel(origin, target + np.array([0, 0, 0.05]), cell)
     assert upwards.before.tolist() == found.before.tolist()
     assert upwards.after.sum() == 0  # others may have gone to the sky beside it

@@ -7,7 +7,7 @@ from numba import njit
 
 
 @njit(nogil=True, cache=True)
-def crossed_range(start, stop, origin, target, margin, reach, edge, cell, low, span, passed, hidden):  # type: ignore[no-untyped-def]
+def crossed_range(start, stop, origin, target, margin, near, far, edge, cell, low, span, passed, hidden):  # type: ignore[no-untyped-def]
     """Count the rays through each voxel of rows [start, stop) of the lattice.
 
     Parameters
@@ -16,9 +16,9 @@ def crossed_range(start, stop, origin, target, margin, reach, edge, cell, low, s
         Rows along x; row r holds the voxels whose first index is ``low[0] + r``.
     origin, target : (r, 3) float64, m
         Sensor and return of each ray.
-    margin, reach : float, m
-        What a ray leaves this far before its return it passed; what it would enter this far behind is hidden by the
-        return, if it is no farther than ``reach`` behind.
+    margin, near, far : float, m
+        What a ray leaves ``margin`` before its return it passed; what it would enter from ``near`` to ``far`` behind
+        its return is hidden by that.
     edge : float, m
         Edge of a voxel; voxel (i, j, k) starts at (i, j, k) * edge.
     cell : (c, 3) int64
@@ -52,7 +52,7 @@ def crossed_range(start, stop, origin, target, margin, reach, edge, cell, low, s
         if length <= margin:
             continue
         d /= length
-        end = length + reach if d[2] < 0.0 else length
+        end = length + far if d[2] < 0.0 else length
         t_low, t_high = _between(o[2], d[2], low[2], low[2] + span[2], edge, 0.0, end)
         t_low, t_high = _between(o[1], d[1], low[1], low[1] + span[1], edge, t_low, t_high)
         t_low, t_high = _between(o[0], d[0], low[0] + start, low[0] + stop, edge, t_low, t_high)
@@ -78,7 +78,7 @@ def crossed_range(start, stop, origin, target, margin, reach, edge, cell, low, s
                     if z_low < z_high:
                         if z_high <= length - margin:
                             passed[v] += 1
-                        elif z_low >= length + margin:
+                        elif z_low >= length + near:
                             hidden[v] += 1
                     v += 1
 

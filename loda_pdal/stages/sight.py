@@ -64,7 +64,7 @@ class Sight:
             return Shown(np.zeros(0, np.bool_), np.zeros(0, np.bool_))
         lattice, p = Lattice.around(cell), self.params
         passed, hidden = np.zeros(len(cell), dtype=np.int32), np.zeros(len(cell), dtype=np.int32)
-        rays = self.sensor, self.xyz[self.point], p.ray_margin_m, p.shadow_m
+        rays = self.sensor, self.xyz[self.point], p.ray_margin_m, p.shadow_from_m, p.shadow_to_m
         run_ranges(
             crossed_range,
             int(lattice.span[0]),

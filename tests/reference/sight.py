@@ -8,7 +8,7 @@ from loda_pdal.model.cloud import FloatArray, Int64Array, IntArray
 
 
 def crossed(
-    origin: FloatArray, target: FloatArray, margin: float, reach: float, edge: float, cell: Int64Array
+    origin: FloatArray, target: FloatArray, margin: float, near: float, far: float, edge: float, cell: Int64Array
 ) -> tuple[IntArray, IntArray]:
     """Rays that pass each voxel (c, 3), and those that go down and whose return keeps them from it, (c,) each."""
     passed, hidden = np.zeros(len(cell), np.int32), np.zeros(len(cell), np.int32)
@@ -18,7 +18,7 @@ def crossed(
             continue
         d = (end - o) / length
         for v, (low, high) in enumerate(zip(cell * edge, (cell + 1) * edge, strict=True)):
-            enter, leave = 0.0, length + reach
+            enter, leave = 0.0, length + far
             for axis in range(3):
                 if d[axis] != 0:
                     at = sorted(((low[axis] - o[axis]) / d[axis], (high[axis] - o[axis]) / d[axis]))
@@ -27,5 +27,5 @@ def crossed(
                     leave = -1.0
             if enter < leave:
                 passed[v] += leave <= length - margin
-                hidden[v] += enter >= length + margin and d[2] < 0
+                hidden[v] += enter >= length + near and d[2] < 0
     return passed, hidden
