@@ -389,6 +389,28 @@ class ObservabilityParams(StageParams):
         0.35, "share of an object the other survey must have been able to see", low=0, high=1
     )
     cell_m: float = param(1.0, "edge of a coverage cell", unit="m", low=0.1, high=10, is_length=True)
+    method: str = param(
+        "rays",
+        "with a trajectory, what its rays passed and what returns hid from them; or columns with returns all the same",
+        choices=("rays", "coverage"),
+    )
+    min_rays: int = param(2, "rays that passed through an occupancy voxel and show that it is empty", low=1, high=1000)
+    station_m: float = param(
+        5.0, "returns of a fused point from so much of the way are one ray", unit="m", low=0.1, high=1000
+    )
+    ray_margin_m: float = param(
+        0.5, "a ray did not pass what lies so close before its return", unit="m", low=0.1, high=10, is_length=True
+    )
+    shadow_from_m: float = param(
+        2.0,
+        "nearer behind a return it is the thing that was hit: what stood there is gone, not hidden",
+        unit="m",
+        low=0.1,
+        high=1000,
+    )
+    shadow_to_m: float = param(
+        30.0, "what a ray meets up to so far behind its return is hidden", unit="m", low=0.1, high=1000
+    )
 
 
 @dataclass(frozen=True)

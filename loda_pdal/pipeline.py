@@ -47,9 +47,13 @@ from loda_pdal.stages.outliers import remove_outliers
 from loda_pdal.stages.proxies import Proxies, build_proxies
 from loda_pdal.stages.registration import register
 from loda_pdal.stages.semantics import Semantics, classify
+from loda_pdal.stages.sight import Sight, lines_of_sight
 from loda_pdal.stages.superpoints import Superpoints, superpoints
 
 Progress = Callable[[int, int, str], None]
+
+NO_SIGHT: Pair[Sight | None] = Pair(None, None)
+"""The rays of surveys without trajectories."""
 
 STEPS = {
     "fuse": "fusing points",
@@ -110,7 +114,8 @@ def detect_changes(
     with clock("objects"):
         objects = match_objects(clouds, ground, instances, proxies, p)
     with clock("changes"):
-        changes = label_objects(clouds, ground, segments, instances, objects, lod, p)
+        sight = look(surveys, fused, registration, p)
+        changes = label_objects(clouds, ground, segments, instances, objects, lod, sight, p)
     with clock("ground_changes"):
         ground_change = compare_ground(clouds, instances, lod, p)
     with clock("result"):
@@ -247,6 +252,19 @@ def match_objects(
     return match_instances(xyz, instances, space, descriptors, proxy_pairs, p.changes.query_radius_m, p.association)
 
 
+def look(
+    surveys: Pair[Survey], fused: Pair[VoxelCloud], registration: Registration, p: Parameters
+) -> Pair[Sight | None]:
+    """Rays of the surveys whose trajectory is known, in the analysis frame."""
+    moves = Pair(registration.T_frame_before, registration.T_frame_after)
+
+    def of_epoch(survey: Survey, cloud: VoxelCloud, T: FloatArray) -> Sight | None:
+        sight = lines_of_sight(survey, cloud, p.observability)
+        return None if sight is None else sight.moved(T)
+
+    return at_once(of_epoch, surveys, fused, moves)
+
+
 def label_objects(
     clouds: Pair[VoxelCloud],
     ground: Pair[Ground],
@@ -254,16 +272,17 @@ def label_objects(
     instances: Pair[Instances],
     objects: Objects,
     lod: LodGrid,
+    sight: Pair[Sight | None],
     p: Parameters,
 ) -> Changes:
-    """Cues and change labels (section 4.3)."""
+    """Cues and change labels (section 4.3); ``sight`` has the rays of epochs whose trajectory is known."""
 
     def surface(cloud: VoxelCloud, g: Ground, s: Segments, i: Instances, own: IntArray) -> Surface:
         is_surface = i.classification != ObjectClass.GROUND
         return Surface(cloud.xyz, s.features.normals, g.height, cloud.n_raw, own, is_surface)
 
     surfaces = at_once(surface, clouds, ground, segments, instances, objects.owner)
-    covered = at_once(lambda cloud: coverage(cloud.xyz, p.observability), clouds)
+    covered = at_once(lambda cloud, rays: coverage(cloud.xyz, p.observability, rays), clouds, sight)
 
     def decide(sides: Pair[Surface], params: ChangeParams) -> Changes:
         found = decide_changes(sides, objects.object_class, covered, lod, params, p.observability, p.confidence)

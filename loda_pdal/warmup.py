@@ -62,7 +62,7 @@ def compile_kernels(folder: Path, progress: Progress | None = None) -> Compiled:
     """
     start = time.perf_counter()
     with event.install_listener("numba:compile", _Count(progress)) as count:
-        surveys = read_epochs(*write_scene(folder))
+        surveys = read_epochs(*write_scene(folder), trajectories=write_trajectories(folder))
         for preset in PRESETS:
             result = detect_changes(surveys.before, surveys.after, Parameters.preset(preset))
         write_outputs(result, surveys, folder / "result", overwrite=True)
@@ -128,6 +128,16 @@ def write_scene(folder: Path) -> Pair[Path]:
     return paths
 
 
+def write_trajectories(folder: Path) -> Pair[Path | None]:
+    """Where the sensor of the scene was: beside it, then above it."""
+    paths = Pair(folder / "before_trajectory.csv", folder / "after_trajectory.csv")
+    rows = [(0, 12, -5, 2.5), (1, 12, -4, 2.5), (2, 12, 12, 60)]
+    lines = ["time,x,y,z", *(",".join(str(v) for v in (t, *(PLACE + xyz))) for t, *xyz in rows)]
+    for path in paths:
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return Pair(*paths)
+
+
 def _box(random: np.random.Generator, low: tuple[float, ...], high: tuple[float, ...], n: int) -> FloatArray:
     """``n`` points (n, 3) on the faces of a box that can be seen: all but the lower one."""
     at = random.random((n, 3))
@@ -144,4 +154,5 @@ def _write_laz(path: Path, xyz: FloatArray) -> None:
     header.add_crs(CRS.from_epsg(EPSG))
     las = laspy.LasData(header)
     las.x, las.y, las.z = xyz.T
+    las.gps_time = np.linspace(0, 2, len(xyz))
     las.write(str(path))

@@ -158,6 +158,7 @@ def score(run_dir: Path, truth_json: Path, as_json: bool, markdown: Path | None)
 @click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
 @_suite_options
 @click.option("--result", default="result", show_default=True, metavar="NAME", help="Folder of the results of a block.")
+@click.option("--trajectories", is_flag=True, help="Tell the method where the sensors were; most users cannot.")
 @click.option("--json", "as_json", is_flag=True, help="Write everything as JSON.")
 @click.option("--markdown", type=click.Path(path_type=Path, dir_okay=False), help="Write the tables to this file too.")
 @click.option("--sheet", type=click.Path(path_type=Path), help="Pictures of the largest mistakes, a PNG or a folder.")
@@ -170,6 +171,7 @@ def run(
     preset: str | None,
     settings: tuple[str, ...],
     result: str,
+    trajectories: bool,
     as_json: bool,
     markdown: Path | None,
     sheet: Path | None,
@@ -191,6 +193,7 @@ def run(
         models=models,
         limit=limit,
         result=result,
+        with_trajectories=trajectories,
         say=_say,
         look=None if sheet is None else tiles.add,
     )

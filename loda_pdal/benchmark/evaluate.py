@@ -32,6 +32,7 @@ from loda_pdal.benchmark.truth import Truth
 from loda_pdal.io.las import read_epochs
 from loda_pdal.io.outputs import write_outputs
 from loda_pdal.model.errors import InputError, LodaError
+from loda_pdal.model.pair import Pair
 from loda_pdal.params import Parameters
 from loda_pdal.pipeline import detect_changes
 
@@ -46,7 +47,7 @@ MOST_CANDIDATES = 40
 _PACKAGE = Path(__file__).resolve().parent.parent
 _SIMULATOR = ("benchmark/simulate", "benchmark/truth.py")
 METHOD_SOURCES = (
-    *(f"io/{name}.py" for name in ("crs", "geopackage", "las", "las_points", "las_writer")),
+    *(f"io/{name}.py" for name in ("crs", "geopackage", "las", "las_points", "las_writer", "trajectory")),
     *("assembly.py", "kernels", "model", "params.py", "pipeline.py", "stages"),
 )
 
@@ -113,6 +114,7 @@ def run_suite(
     models: Path | None = None,
     limit: int | None = None,
     result: str = "result",
+    with_trajectories: bool = False,
     say: Say = lambda text: None,
     look: Callable[[str, Path, JudgedPoints, Truth, ScoreReport], None] | None = None,
 ) -> SuiteScore:
@@ -132,6 +134,8 @@ def run_suite(
         Blocks to run: the first ones.
     result : str
         Name of the folder of results in the folder of each block.
+    with_trajectories : bool
+        Tell the method where the sensors were.
     say : callable
         Told what is going on.
     look : callable, optional
@@ -139,7 +143,7 @@ def run_suite(
     """
     blocks = []
     for name, block_dir in prepared_blocks(folder, suite, split, models=models, limit=limit, say=say):
-        seconds = _ensure_result(block_dir, result, parameters, name, say)
+        seconds = _ensure_result(block_dir, result, parameters, name, say, with_trajectories)
         truth = Truth.read(block_dir / "truth.json")
         points = read_run(block_dir / result, truth, block_dir)
         report = judge(points, truth)
@@ -148,7 +152,8 @@ def run_suite(
         blocks.append(BlockScore(name, report, seconds))
         took = "" if seconds is None else f" in {seconds:.0f} s"
         say(f"{name}: mIoU {_per_cent(report.scores().macro_iou)}, {report.false_alarms_per_ha:.1f} alarms/ha{took}")
-    return SuiteScore(suite, split, described(parameters), blocks)
+    told = described(parameters) + (" with trajectories" if with_trajectories else "")
+    return SuiteScore(suite, split, told, blocks)
 
 
 def prepared_blocks(
@@ -216,13 +221,16 @@ def _ensure_block(folder: Path, block: SuiteBlock, say: Say) -> bool:
     return has_room
 
 
-def _ensure_result(block_dir: Path, result: str, parameters: Parameters, name: str, say: Say) -> float | None:
+def _ensure_result(
+    block_dir: Path, result: str, parameters: Parameters, name: str, say: Say, with_trajectories: bool
+) -> float | None:
     """Run the method on a block unless its result is there; seconds that it took."""
     stamp_path = block_dir / f"{result}.json"
     stamp = {
         "block": hashlib.sha256((block_dir / "block.json").read_bytes()).hexdigest(),
         "parameters": json.loads(json.dumps(parameters.to_dict())),
         "method": sources_digest(*METHOD_SOURCES),
+        "with_trajectories": with_trajectories,
     }
     if read_stamp(stamp_path) == stamp and (block_dir / result / "run.json").is_file():
         return None
@@ -230,7 +238,11 @@ def _ensure_result(block_dir: Path, result: str, parameters: Parameters, name: s
     stamp_path.unlink(missing_ok=True)
     start = time.perf_counter()
     try:
-        surveys = read_epochs(block_dir / "before.laz", block_dir / "after.laz")
+        before, after = block_dir / "before.laz", block_dir / "after.laz"
+        ways: Pair[Path | None] = Pair(None, None)
+        if with_trajectories:
+            ways = Pair(block_dir / "before_trajectory.csv", block_dir / "after_trajectory.csv")
+        surveys = read_epochs(before, after, trajectories=ways)
         found = detect_changes(surveys.before, surveys.after, parameters)
     except LodaError as error:
         raise InputError(f"{name}: {error.message}", error.remedy, error.code) from error

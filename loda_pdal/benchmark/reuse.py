@@ -54,7 +54,8 @@ class Runs:
         classes = step(pipeline.classify_superpoints, clouds, segments)
         instances = step(pipeline.segment_instances, clouds, ground, classes)
         objects = step(pipeline.match_objects, clouds, ground, instances, proxies)
-        changes = step(pipeline.label_objects, clouds, ground, segments, instances, objects, lod)
+        sight = step(pipeline.look, surveys, fused, registration)
+        changes = step(pipeline.label_objects, clouds, ground, segments, instances, objects, lod, sight)
         ground_change = step(pipeline.compare_ground, clouds, instances, lod)
         if self._first is None:
             self._first = done

@@ -26,6 +26,15 @@ if TYPE_CHECKING:
     "-o", "--output", "folder", required=True, type=click.Path(path_type=Path), help="Folder for the results."
 )
 @options.parameters
+@click.option(
+    "--trajectory-before",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="Where the sensor was in the survey BEFORE: CSV with time, x, y, z, or LAS with GPS time.",
+)
+@click.option(
+    "--trajectory-after", metavar="FILE", type=click.Path(path_type=Path), help="The same of the survey AFTER."
+)
 @options.epsg
 @options.assume_same_crs
 @options.threads
@@ -52,6 +61,8 @@ def detect(
     preset: str | None,
     params_file: Path | None,
     settings: tuple[str, ...],
+    trajectory_before: Path | None,
+    trajectory_after: Path | None,
     epsg: int | None,
     assume_same_crs: bool,
     threads: int | None,
@@ -69,9 +80,11 @@ def detect(
             stopping.when_parent_dies()
         parameters = options.chosen_parameters(preset, params_file, settings)
         from loda_pdal.io.outputs import check_output_folder
+        from loda_pdal.model.pair import Pair
 
         check_output_folder(folder, overwrite, (before, after))
-        surveys = _read(reporter, before, after, parameters, epsg, assume_same_crs, max_memory)
+        trajectories = Pair(trajectory_before, trajectory_after)
+        surveys = _read(reporter, before, after, trajectories, parameters, epsg, assume_same_crs, max_memory)
         if validate:
             reporter.info("Everything is in order; nothing was computed.")
             return
@@ -91,6 +104,7 @@ def _read(
     reporter: Reporter,
     before: Path,
     after: Path,
+    trajectories: Pair[Path | None],
     parameters: Parameters,
     epsg: int | None,
     assume_same_crs: bool,
@@ -108,6 +122,7 @@ def _read(
         assume_same_crs=assume_same_crs,
         max_memory=None if max_memory is None else int(max_memory * 1e9),
         leaf_m=parameters.fuse.leaf_m,
+        trajectories=trajectories,
     )
     for epoch in surveys:
         for note in epoch.notes:

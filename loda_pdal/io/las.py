@@ -19,6 +19,7 @@ from loda_pdal.io.crs import DeclaredCrs, MapCrs, common_crs, declared_crs
 from loda_pdal.io.gps_time import gps_day
 from loda_pdal.io.las_points import LasFile, broken, reading, unreadable
 from loda_pdal.io.memory import check_memory, estimate_memory
+from loda_pdal.io.trajectory import MapTrajectory, TrajectoryCheck, read_trajectory
 from loda_pdal.model.cloud import ORIGIN_STEP, FloatArray
 from loda_pdal.model.errors import InputError
 from loda_pdal.model.extent import Extent
@@ -151,6 +152,7 @@ def read_epochs(
     assume_same_crs: bool = False,
     max_memory: int | None = None,
     leaf_m: float = 0.25,
+    trajectories: Pair[Path | None] | None = None,
 ) -> Pair[Survey]:
     """Both surveys in one local frame, or an `InputError` that says what to do.
 
@@ -166,6 +168,8 @@ def read_epochs(
         Bytes the run may take; what is free if left out (`MemoryLimitError`).
     leaf_m : float, m
         Edge of the finest voxel of the run to come, for the memory estimate.
+    trajectories : Pair of Path or None, optional
+        Where the sensor was (see `read_trajectory`), in the CRS of the survey; either may be left out.
 
     Returns
     -------
@@ -177,20 +181,32 @@ def read_epochs(
         infos.map(lambda info: info.crs), infos.map(_short_name), epsg=epsg, assume_same_crs=assume_same_crs
     )
     _check_headers(infos, crs)
+    paths = trajectories or Pair(None, None)
+    ways = infos.join(paths, lambda info, path: None if path is None else _trajectory_for(info, path))
     check_memory(_memory_needed(infos, crs, leaf_m), max_memory)
     files = infos.map(lambda info: LasFile(Path(info.path), info.n_points))
     frame = common_frame(infos.map(lambda info: np.array(info.low if info.has_bounds else (0.0, 0.0, 0.0))), crs)
-    found = at_once(lambda file: _look_through(file, frame), files)
+    found = at_once(lambda file, way: _look_through(file, frame, way), files, ways)
     true_frame = common_frame(found.map(lambda each: each.low), crs)
     if true_frame != frame:  # a header's bounds are wrong
         frame = true_frame
-        found = at_once(lambda file: _look_through(file, frame), files)
+        found = at_once(lambda file, way: _look_through(file, frame, way), files, ways)
     check_coverage(infos.map(_short_name), found.map(lambda each: each.extent))
 
-    def survey(file: LasFile, seen: _Found, notes: list[str]) -> Survey:
-        return Survey(file, frame, str(file.path), notes, seen.dates, file.n_bytes, seen.sha256, seen.extent)
+    def survey(file: LasFile, seen: _Found, notes: list[str], way: MapTrajectory | None) -> Survey:
+        return Survey(
+            file,
+            frame,
+            str(file.path),
+            [*notes, *seen.notes],
+            seen.dates,
+            file.n_bytes,
+            seen.sha256,
+            seen.extent,
+            None if way is None else way.local(frame),
+        )
 
-    return Pair(*(survey(*each) for each in zip(files, found, crs.notes, strict=True)))
+    return Pair(*(survey(*each) for each in zip(files, found, crs.notes, ways, strict=True)))
 
 
 def common_frame(low: Pair[FloatArray], crs: MapCrs) -> LocalFrame:
@@ -212,19 +228,22 @@ def check_coverage(names: Pair[str], extents: Pair[Extent]) -> None:
 class _Found:
     """What a first look at all points of a file finds.
 
-    ``low`` are the lowest full map coordinates (3,), ``dates`` the first and last day of measurement.
+    ``low`` are the lowest full map coordinates (3,), ``dates`` the first and last day of measurement, ``notes`` what is
+    to be said about the trajectory.
     """
 
     extent: Extent
     low: FloatArray
     dates: tuple[str | None, str | None]
     sha256: str
+    notes: list[str]
 
 
-def _look_through(file: LasFile, frame: LocalFrame) -> _Found:
+def _look_through(file: LasFile, frame: LocalFrame, way: MapTrajectory | None) -> _Found:
     """Decompress everything once: damage shows here, and not after long work."""
     low, times = np.full(3, np.inf), [np.inf, -np.inf]
     is_dated = _has_absolute_time(file.header)
+    check = None if way is None else TrajectoryCheck(way.local(frame), file.path.name)
 
     def local_parts() -> Iterator[FloatArray]:
         for record in file.records():
@@ -234,10 +253,25 @@ def _look_through(file: LasFile, frame: LocalFrame) -> _Found:
             if is_dated:
                 gps_time = np.asarray(record["gps_time"])
                 times[:] = min(times[0], float(gps_time.min())), max(times[1], float(gps_time.max()))
-            yield frame.to_local(xyz)
+            local = frame.to_local(xyz)
+            if check is not None:
+                check.add(local, np.asarray(record["gps_time"], dtype=np.float64))
+            yield local
 
     extent = Extent.of(local_parts())
-    return _Found(extent, low, (gps_day(times[0]), gps_day(times[1])), file.sha256())
+    notes = [] if check is None else [check.note()]
+    return _Found(extent, low, (gps_day(times[0]), gps_day(times[1])), file.sha256(), notes)
+
+
+def _trajectory_for(info: SurveyInfo, path: Path) -> MapTrajectory:
+    """The trajectory of a survey; `InputError` where its points do not say when they were measured."""
+    if "gps_time" not in info.dimensions:
+        raise InputError(
+            f"{info.path}: its points have no GPS time (point format {info.point_format}), which a trajectory needs.",
+            "Leave the trajectory out, or give the survey with GPS times (point format 1, 3 or 6 and above).",
+            "trajectory-times",
+        )
+    return read_trajectory(path)
 
 
 def _has_absolute_time(header: Any) -> bool:

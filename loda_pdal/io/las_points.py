@@ -74,6 +74,12 @@ class LasFile:
         only_xyz = DecompressionSelection.base().decompress_z()
         return map(self.map_coordinates, self.records() if self._is_small else self._decompressed(only_xyz))
 
+    def gps_times(self) -> Iterator[FloatArray]:
+        """GPS times (k,) s, part by part; the points must have them."""
+        only_time = DecompressionSelection.base() | DecompressionSelection.GPS_TIME
+        for record in self.records() if self._is_small else self._decompressed(only_time):
+            yield np.asarray(record["gps_time"], dtype=np.float64)
+
     def map_coordinates(self, record: Any) -> FloatArray:
         """Full map coordinates (k, 3) of one of the `records`; `InputError` where they are not finite."""
         xyz = map_coordinates(record, self.header.scales, self.header.offsets)

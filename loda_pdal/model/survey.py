@@ -12,6 +12,7 @@ import numpy as np
 from loda_pdal.model.cloud import FloatArray
 from loda_pdal.model.extent import Extent
 from loda_pdal.model.frame import LocalFrame
+from loda_pdal.model.trajectory import Trajectory
 
 PART = 400_000
 """Points of one part: what is held of a survey at a time, and a multiple of the chunks of LAZ files."""
@@ -24,6 +25,10 @@ class PointSource(Protocol):
 
     def coordinates(self) -> Iterator[FloatArray]:
         """Full map coordinates (k, 3), part by part, in the same order every time."""
+        ...
+
+    def gps_times(self) -> Iterator[FloatArray]:
+        """GPS times (k,) s, part by part, in the order of the points."""
         ...
 
 
@@ -47,6 +52,10 @@ class Survey:
         Size and checksum of the file as it was read.
     known_extent : Extent or None
         What the reader found in passing; worked out when first asked for if left out.
+    trajectory : Trajectory or None
+        Where the sensor was, at the points' GPS times; None where that is not known.
+    gps_time : (n,) float64 or None, s
+        Of points in memory that come with a trajectory.
     """
 
     points: FloatArray | PointSource
@@ -57,6 +66,12 @@ class Survey:
     n_bytes: int | None = None
     sha256: str | None = None
     known_extent: Extent | None = None
+    trajectory: Trajectory | None = None
+    gps_time: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        if self.trajectory is not None and self.source is None and self.gps_time is None:
+            raise ValueError("points in memory that come with a trajectory need their GPS times")
 
     def __len__(self) -> int:
         return len(self.points)
@@ -86,3 +101,11 @@ class Survey:
         else:
             for xyz in self.points.coordinates():
                 yield self.frame.to_local(xyz)
+
+    def gps_times(self) -> Iterator[FloatArray]:
+        """GPS times (k,) s, part by part in the order of the points, where there is a trajectory."""
+        if self.gps_time is not None:
+            for start in range(0, len(self.gps_time), PART):
+                yield self.gps_time[start : start + PART]
+        elif self.source is not None:
+            yield from self.source.gps_times()

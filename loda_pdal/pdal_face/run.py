@@ -248,6 +248,7 @@ STEPS: dict[str, Callable[[Run], Any]] = {
         run["instances"],
         run["objects"],
         run["lod"],
+        pipeline.NO_SIGHT,
         run.parameters,
     ),
     "ground_changes": lambda run: pipeline.compare_ground(run.clouds, run["instances"], run["lod"], run.parameters),

@@ -289,6 +289,7 @@ class Cue(NamedTuple):
     column_rise: float
     lod95: float
     observability: float
+    hidden: float
     rise: float
     n_voxels: float
     volume_before: float
@@ -374,7 +375,7 @@ def _verdict(
         return Verdict(
             ChangeLabel.UNDETERMINED,
             f"both surveys saw only {cue.observability:.0%} of it "
-            f"(at least {observability.min_observability:.0%} needed)",
+            f"(at least {observability.min_observability:.0%} needed){_hidden(cue)}",
         )
     if cue.object_class == ObjectClass.MOBILE:
         return _mobile(cue, params)
@@ -445,7 +446,7 @@ def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: Ob
         return Verdict(
             ChangeLabel.UNDETERMINED,
             f"the {other} survey could have seen only {cue.observability:.0%} of it "
-            f"(at least {observability.min_observability:.0%} needed)",
+            f"(at least {observability.min_observability:.0%} needed){_hidden(cue)}",
         )
     if is_apart:
         return Verdict(
@@ -461,6 +462,11 @@ def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: Ob
         f"no match in the {other} survey, which shows {support:.0%} of its surface "
         f"and could have seen {cue.observability:.0%} of it",
     )
+
+
+def _hidden(cue: Cue) -> str:
+    """How much of an object that was not seen had something before it, where rays say so."""
+    return f"; {cue.hidden:.0%} was hidden behind what stood nearer to the sensor" if cue.hidden > 0 else ""
 
 
 def _mobile(cue: Cue, params: ChangeParams) -> Verdict:

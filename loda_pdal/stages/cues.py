@@ -84,9 +84,11 @@ class Voxels:
     is_near : Pair of (c,) bool
         Whether that epoch has a surface within the query radius of the centre.
     is_covered : Pair of (c,) bool
-        Whether that epoch saw the voxel's column.
+        Whether that epoch saw the voxel, or its column where no ray says more.
     is_over : Pair of (c,) bool
         Whether that epoch has a return in the voxel's column beneath the voxel: its rays went in there.
+    is_hidden : Pair of (c,) bool
+        Whether the voxel was hidden from that epoch behind something nearer to its sensor.
     normal : (c, 3) float64
         Mean unit normal of both epochs' nearest surfaces, of either sign; zero where either surface is missing.
     displacement : (c,) float64, m
@@ -104,6 +106,7 @@ class Voxels:
     is_near: Pair[BoolArray]
     is_covered: Pair[BoolArray]
     is_over: Pair[BoolArray]
+    is_hidden: Pair[BoolArray]
     normal: FloatArray
     displacement: FloatArray
     lod95: FloatArray
@@ -229,6 +232,8 @@ class Evidence:
         Median limit of detection.
     observability
         Share of the voxels that both surveys saw or could have seen.
+    hidden
+        Share of the voxels of which the other survey shows nothing, because something stood before them.
     rise : m
         How far the mean height of occupancy moves up inside the overlap.
     """
@@ -252,6 +257,7 @@ class Evidence:
     column_rise: FloatArray
     lod95: FloatArray
     observability: FloatArray
+    hidden: FloatArray
     rise: FloatArray
 
     def at(self, index: Int64Array) -> Evidence:
@@ -285,9 +291,13 @@ def sample_voxels(
     centre = np.asarray((cell + 0.5) * params.voxel_m, dtype=np.float64)
     found = surfaces.map(lambda surface: _nearest_surface(surface, centre, params.query_radius_m))
     normal, displacement = _displacement(surfaces, found)
-    always = np.ones(len(cell), np.bool_)
+    always, never = np.ones(len(cell), np.bool_), np.zeros(len(cell), np.bool_)
+    covered, hidden = Pair(always, always), Pair(never, never)
     is_open = xyz.map(lambda points: np.ones(len(points), np.bool_))
     if coverage:
+        shown = coverage.map(lambda side: side.shown(cell, params.voxel_m))
+        hidden = shown.map(lambda rays: rays.is_hidden)
+        covered = coverage.join(shown, lambda side, rays: rays.corrected(side.at(centre)))
         is_open = coverage.swapped.join(xyz, lambda other, points: other.at(points))
     return Voxels(
         cell=cell,
@@ -297,8 +307,9 @@ def sample_voxels(
         starts=starts,
         is_open=np.concatenate(list(is_open))[order],
         is_near=found.map(lambda idx: idx >= 0),
-        is_covered=coverage.map(lambda side: side.at(centre)) if coverage else Pair(always, always),
+        is_covered=covered,
         is_over=surfaces.map(lambda surface: _is_over(centre, cell, columns, surface.xyz, params.voxel_m)),
+        is_hidden=hidden,
         normal=normal,
         displacement=displacement,
         lod95=lod.at(centre),
@@ -400,6 +411,10 @@ def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -
     )
     n_voxels = own.map(lambda side: _count(side, side >= 0, n))
     n_known = own.join(is_known, lambda side, known: _count(side, known, n))
+    n_hidden = Pair(
+        _count(own.before, ~is_known.before & voxels.is_hidden.after, n),
+        _count(own.after, ~is_known.after & voxels.is_hidden.before, n),
+    )
     n_measured = own.join(cells.is_measured, lambda side, measured: _count(side, measured, n))
     n_shared = Pair(
         _count(own.before, cells.is_measured.before & cells.is_near.after, n),
@@ -451,6 +466,7 @@ def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -
         column_rise=_column_rise(voxels, surfaces, n),
         lod95=Groups(owner, n).median(voxels.lod95[voxel]),
         observability=(n_known.before + n_known.after) / np.maximum(n_voxels.before + n_voxels.after, 1),
+        hidden=(n_hidden.before + n_hidden.after) / np.maximum(n_voxels.before + n_voxels.after, 1),
         rise=_rise(cells, n),
     )
 
