@@ -105,7 +105,9 @@ def test_auto_says_which_preset_suits_the_surveys(
 ) -> None:
     arguments = ["detect", *two_surveys, "-o", str(tmp_path / "out"), "--preset", "auto", "--validate"]
     assert run(arguments) == 0
-    assert "Preset aerial: the densest quarter of the plan holds 42% and 43% of" in " ".join(capsys.readouterr().err.split())
+    assert "Preset aerial: the densest quarter of the plan holds 42% and 43% of" in " ".join(
+        capsys.readouterr().err.split()
+    )
     assert run([*arguments, "--set", "lod.radius=1"]) == 1
 
 
