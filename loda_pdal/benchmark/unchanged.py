@@ -16,6 +16,8 @@ import numpy.typing as npt
 
 from loda_pdal.benchmark.evaluate import KnownBlock, Say, described, prepared_blocks, read_block
 from loda_pdal.benchmark.metrics import markdown_table
+from loda_pdal.benchmark.protocols import judge
+from loda_pdal.benchmark.runs import judged_result
 from loda_pdal.benchmark.truth import Truth
 from loda_pdal.io.summary import is_changed
 from loda_pdal.model.cloud import BoolArray, Int64Array
@@ -53,13 +55,27 @@ class Coverage(NamedTuple):
 
 @dataclass(frozen=True)
 class UnchangedBlock:
-    """One block: its name, coverage by surface, objects, those called changed, and pieces of changed ground."""
+    """What the method says of one block.
+
+    Attributes
+    ----------
+    coverage : dict
+        By surface; ``all`` for all of them.
+    n_objects, n_ground : int
+        Objects, and pieces of ground that are called changed.
+    changed : list of ObjectRecord
+        Objects that are called changed.
+    alarms : frozenset of int
+        Which of these count: the others lie on instances that the surveys hold too few returns of to be judged (strict
+        protocol, `loda_pdal.benchmark.protocols`).
+    """
 
     name: str
     coverage: dict[str, Coverage]
     n_objects: int
-    changed: list[ObjectRecord]
     n_ground: int
+    changed: list[ObjectRecord]
+    alarms: frozenset[int]
 
 
 @dataclass(frozen=True)
@@ -83,7 +99,7 @@ class Unchanged:
                     "coverage": {s: _plain(found) for s, found in block.coverage.items()},
                     "objects": block.n_objects,
                     "changed_ground": block.n_ground,
-                    "changed": [_plain_object(o) for o in block.changed],
+                    "changed": [_plain_object(o) | {"counts": o.object_id in block.alarms} for o in block.changed],
                 }
                 for block in self.blocks
             },
@@ -95,21 +111,34 @@ class Unchanged:
             "all",
             {s: self.coverage(s) for s in ("all", *SURFACES)},
             sum(block.n_objects for block in self.blocks),
-            [o for block in self.blocks for o in block.changed],
             sum(block.n_ground for block in self.blocks),
+            [o for block in self.blocks for o in block.changed],
+            frozenset(),
         )
-        header = ["block", "cells", "all, %", *SURFACES, "median LoD95, m", "objects", "changed", "changed ground"]
+        n_alarms = sum(len(block.alarms) for block in self.blocks)
+        header = [
+            "block",
+            "cells",
+            "all, %",
+            *SURFACES,
+            "median LoD95, m",
+            "objects",
+            "changed",
+            "that count",
+            "ground",
+        ]
         lines = [
             f"# Nothing changed: {self.title}",
             "Cells whose displacement is within LoD95, by surface, and what is called changed:",
-            markdown_table(header, [_row(block) for block in (*self.blocks, everything)]),
+            markdown_table(header, [*(_row(b, len(b.alarms)) for b in self.blocks), _row(everything, n_alarms)]),
         ]
         if everything.changed:
-            called = ["block", "object", "label", "class", "m2", "points", "reason"]
+            called = ["block", "object", "counts", "label", "class", "m2", "points", "reason"]
             rows = [
                 [
                     block.name,
                     o.object_id,
+                    "yes" if o.object_id in block.alarms else "no",
                     o.label.title,
                     o.object_class.title,
                     f"{o.footprint.area:.1f}",
@@ -138,10 +167,17 @@ def survey_unchanged(
     for name, block_dir in prepared_blocks(folder, suite, split, models=models, limit=limit, say=say, has_edits=False):
         known = read_block(block_dir)
         result = detect_changes(known.surveys.before, known.surveys.after, parameters)
-        changed = [o for o in result.objects if is_changed(o)]
-        found = coverage_of(result.lod, surface_of_cells(result, known))
-        blocks.append(UnchangedBlock(name, found, len(result.objects), changed, len(result.ground_changes)))
-        say(f"{name}: {len(changed)} of {len(result.objects)} objects called changed")
+        judged = judge(judged_result(result, known.annotation, known.truth.T_after_before), known.truth)
+        block = UnchangedBlock(
+            name,
+            coverage_of(result.lod, surface_of_cells(result, known)),
+            len(result.objects),
+            len(result.ground_changes),
+            [o for o in result.objects if is_changed(o)],
+            frozenset(alarm.object_id for alarm in judged.false_alarms),
+        )
+        blocks.append(block)
+        say(f"{name}: {len(block.changed)} of {block.n_objects} objects called changed, {len(block.alarms)} that count")
     return Unchanged(f"suite {suite}, {split} split: {len(blocks)} blocks, {described(parameters)}", blocks)
 
 
@@ -189,7 +225,7 @@ def _pooled(found: Iterable[Coverage]) -> Coverage:
     return Coverage(np.concatenate([p.is_within for p in parts]), np.concatenate([p.lod95 for p in parts]))
 
 
-def _row(block: UnchangedBlock) -> list[Any]:
+def _row(block: UnchangedBlock, n_alarms: int) -> list[Any]:
     whole = block.coverage["all"]
     return [
         block.name,
@@ -198,6 +234,7 @@ def _row(block: UnchangedBlock) -> list[Any]:
         None if whole.median_m is None else f"{whole.median_m:.3f}",
         block.n_objects,
         len(block.changed),
+        n_alarms,
         block.n_ground,
     ]
 
