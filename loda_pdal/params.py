@@ -115,6 +115,13 @@ class OutlierParams(StageParams):
     is_enabled: bool = param(True, "remove statistical outliers")
     k: int = param(20, "neighbours whose mean distance is judged", symbol="k", low=1, high=200)
     std_multiplier: float = param(3.0, "standard deviations above the mean that make an outlier", low=0.1, high=20)
+    keep_voxels: int = param(
+        8,
+        "outliers that hang together in clusters of this many are thin or far away and stay; 0: none",
+        low=0,
+        high=10000,
+    )
+    keep_gap_m: float = param(0.6, "largest gap within such a cluster", unit="m", low=0.05, high=20, is_length=True)
 
 
 @dataclass(frozen=True)
@@ -255,6 +262,9 @@ class AssociationParams(StageParams):
     unmatched_cost: float = param(3.0, "cost of leaving an object unmatched", low=0, high=100)
     solver: str = param("hungarian", "optimal or greedy assignment", choices=("hungarian", "greedy"))
     boxes: str = param("upright", "gravity-aligned boxes, or 3D principal axes", choices=("upright", "pca"))
+    splits_merged: bool = param(
+        True, "a thing that stands apart in one epoch is taken out of what it is merged with in the other"
+    )
 
 
 @dataclass(frozen=True)
@@ -425,6 +435,13 @@ class ChangeParams(StageParams):
     min_support: float = param(
         0.5, "share of an unmatched object's surface in the other survey that makes it Unchanged", low=0, high=1
     )
+    within_share: float = param(
+        0.2,
+        "a plant or other object of which the other survey shows less than this share is another one, and what it shows "
+        "there is a thing in its midst; 0: never",
+        low=0,
+        high=1,
+    )
     backing_voxels: int = param(
         8, "occupancy voxels gained or lost that must back a height or volume cue; 0: none", low=0, high=10000
     )
@@ -437,12 +454,22 @@ class ChangeParams(StageParams):
         low=0,
         high=1000,
     )
+    weighs_sampling: bool = param(
+        False,
+        "gained and lost voxels count by the odds that the other survey's points would have met them: a crown sampled "
+        "more densely fills more voxels and has not grown",
+    )
+    needs_sight: bool = param(
+        True,
+        "what is solid is gained or lost only where the other survey shows something beneath it and nothing of the same "
+        "object above it: else it was hidden",
+    )
     volume_sigmas: float = param(
         0.0, "gained less lost voxels must exceed this many times the root of their sum; 0: need not", low=0, high=100
     )
     replaced_m: float = param(
-        0.15,
-        "difference of the tops that makes a parked vehicle another one, where its surface moved by half of that; "
+        0.045,
+        "how far a quarter of a parked vehicle's surface must be off, after the best move, to make it another one; "
         "0: never",
         unit="m",
         low=0,
@@ -452,7 +479,7 @@ class ChangeParams(StageParams):
     part_of_length_m: float = param(
         15.0, "only objects longer than this are looked through for parts", unit="m", low=0, high=1000
     )
-    part_min_voxels: int = param(24, "occupancy voxels of the smallest part", low=1, high=10000)
+    part_min_voxels: int = param(12, "occupancy voxels of the smallest part", low=1, high=10000)
     part_min_width_m: float = param(
         0.0,
         "a part is at least this wide in plan: edges of roofs that the surveys sampled differently do not",
@@ -469,8 +496,22 @@ class ChangeParams(StageParams):
         high=100,
         is_length=True,
     )
+    frontage_m: float = param(
+        6.0,
+        "width of a house in a row: what is built onto a house changes it, and this much of a longer row; 0: only the part "
+        "changes",
+        unit="m",
+        low=0,
+        high=100,
+    )
+    thing_voxels: int = param(
+        5,
+        "occupancy voxels of the smallest thing that came or went beside what it is merged with; 0: none are looked for",
+        low=0,
+        high=10000,
+    )
     part_is_new_m3: float = param(
-        80.0,
+        16.0,
         "a part of a building that only one survey has, and as large as this, is a building that was Added or Removed",
         unit="m3",
         low=0,
@@ -498,7 +539,7 @@ class ChangeParams(StageParams):
 
     def for_bodies(self) -> ChangeParams:
         """The parameters for buildings that are filled."""
-        return replace(self, voxel_m=self.body_voxel_m, query_radius_m=self.body_query_radius_m)
+        return replace(self, voxel_m=self.body_voxel_m, query_radius_m=self.body_query_radius_m, weighs_sampling=False)
 
 
 @dataclass(frozen=True)
@@ -733,6 +774,8 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
         "name": "aerial",
         "adapts_to_spacing": True,
         "fuse": {"leaf_m": 0.5},
+        "outliers": {"keep_voxels": 0},
+        "association": {"splits_merged": False},
         "normals": {"radius_m": 1.5},
         "icp": {"leaves_m": (2.0, 1.0, 0.5), "radii_m": (3.0, 1.5, 0.75)},
         "ground": {"max_object_m": 60.0, "min_voxels": 4},
@@ -760,21 +803,28 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "min_samples": 20,
             "min_expected_points": 0.0,
             "volume_sigmas": 3.0,
+            "weighs_sampling": True,
             "backing_voxels": 4,
             "vegetation_height_m": 0.8,
             "fills_buildings": True,
             "part_min_width_m": 1.5,
             "plant_width_m": 2.5,
+            "needs_sight": False,
+            "within_share": 0.0,
+            "thing_voxels": 0,
+            "part_min_voxels": 24,
+            "part_is_new_m3": 80.0,
+            "frontage_m": 0.0,
         },
         "observability": {"cell_m": 2.0},
     },
     "paper": {
         "name": "paper",
-        "outliers": {"std_multiplier": 1.0},
+        "outliers": {"std_multiplier": 1.0, "keep_voxels": 0},
         "icp": {"covariance": "normal", "adapts_tukey": False},
         "ground": {"vertical": "ground"},
         "lod": {"pose_term": "translation", "small_sample": False, "drift_term": "none"},
-        "association": {"boxes": "pca"},
+        "association": {"boxes": "pca", "splits_merged": False},
         "superpoints": {"absorb_below": 1},
         "semantics": {
             "vegetation_sphericity": 0.35,
@@ -795,6 +845,9 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "backing_voxels": 0,
             "backing_share": 0.0,
             "min_expected_points": 0.0,
+            "needs_sight": False,
+            "within_share": 0.0,
+            "thing_voxels": 0,
             "replaced_m": 0.0,
         },
     },

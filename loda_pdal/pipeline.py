@@ -34,7 +34,7 @@ from loda_pdal.params import ChangeParams, Parameters
 from loda_pdal.preset_choice import doubts_about
 from loda_pdal.stages.association import Descriptors, Matches, associate, describe
 from loda_pdal.stages.changes import Changes, decide_changes
-from loda_pdal.stages.correspondence import Objects, match_instances, owners
+from loda_pdal.stages.correspondence import Objects, match_instances
 from loda_pdal.stages.cues import Surface
 from loda_pdal.stages.features import Features, eigen_features
 from loda_pdal.stages.filling import bodies, filled, filled_everywhere
@@ -258,13 +258,12 @@ def label_objects(
     p: Parameters,
 ) -> Changes:
     """Cues and change labels (section 4.3)."""
-    owner = instances.join(objects.of_instance, owners)
 
     def surface(cloud: VoxelCloud, g: Ground, s: Segments, i: Instances, own: IntArray) -> Surface:
         is_surface = i.classification != ObjectClass.GROUND
         return Surface(cloud.xyz, s.features.normals, g.height, cloud.n_raw, own, is_surface)
 
-    surfaces = at_once(surface, clouds, ground, segments, instances, owner)
+    surfaces = at_once(surface, clouds, ground, segments, instances, objects.owner)
     covered = at_once(lambda cloud: coverage(cloud.xyz, p.observability), clouds)
 
     def decide(sides: Pair[Surface], params: ChangeParams) -> Changes:

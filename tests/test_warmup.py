@@ -73,7 +73,7 @@ def test_warmup_reaches_every_kernel(tmp_path: Path) -> None:
 
 def test_every_module_of_kernels_is_looked_through() -> None:
     modules = {kernel.py_func.__module__.rpartition(".")[2] for kernel in kernels()}
-    with_kernels = {p.stem for p in Path(loda_pdal.kernels.__file__).parent.glob("*.py") if "@njit" in p.read_text()}
+    with_kernels = {p.stem for p in Path(loda_pdal.kernels.__file__).parent.glob("*.py") if "@kernel" in p.read_text()}
     assert with_kernels - modules == {name.rpartition(".")[2] for name in warmup.SIMULATION}
 
 

@@ -81,6 +81,9 @@ def _say(text: str) -> None:
     click.echo(text, err=True)
 
 
+_FOLDER = click.Path(path_type=Path, exists=True, file_okay=False)
+
+
 @click.group()
 def bench() -> None:
     """Simulated scenes with known truth, scores, and what a run costs."""
@@ -272,6 +275,73 @@ def sheet(run_dir: Path, truth_json: Path | None, out: Path, largest: int, per_p
         found.add("", run_dir, points, truth, judge(points, truth))
         tiles, title = found.largest, f"{name}: {len(found.largest)} of {found.n} mistakes"
     for path in write_sheets(tiles, title, out, per_page):
+        click.echo(path)
+
+
+@bench.command()
+@click.argument("folders", metavar="BLOCK_DIR...", nargs=-1, required=True, type=_FOLDER)
+@click.option("--train", "training", metavar="BLOCK_DIR", multiple=True, type=_FOLDER, help="Block to train on.")
+@click.option(
+    "--preset",
+    type=click.Choice(("street", "aerial")),
+    default="street",
+    show_default=True,
+    help="Parameters of our own method, and of the baselines tuned for such surveys.",
+)
+@click.option("--tune", "is_tuning", is_flag=True, help="Search the baselines' parameters on these blocks instead.")
+@click.option("--json", "as_json", is_flag=True, help="Write everything as JSON.")
+@click.option("--markdown", type=click.Path(path_type=Path, dir_okay=False), help="Write the table to this file too.")
+def baselines(
+    folders: tuple[Path, ...],
+    training: tuple[Path, ...],
+    preset: str,
+    is_tuning: bool,
+    as_json: bool,
+    markdown: Path | None,
+) -> None:
+    """Compare loda-pdal with M3C2, nDSM differencing, a random forest and C2C on the blocks in BLOCK_DIR...
+
+    All get the same registration and ground heights. The random forest is trained on the blocks given with --train.
+    """
+    from loda_pdal.benchmark.baselines import run_baselines, tune
+
+    _compile_kernels()
+    if is_tuning:
+        for name, found in tune(folders, training=training, preset=preset, say=_say).items():
+            click.echo(f"{name}: {found.params}, mIoU {100 * found.macro_iou:.1f}")
+        return
+    comparison = run_baselines(folders, training=training, preset=preset, say=_say)
+    if markdown is not None:
+        markdown.write_text(comparison.to_markdown() + "\n", encoding="utf-8")
+    click.echo(json.dumps(comparison.to_dict()) if as_json else comparison.to_markdown())
+
+
+@bench.command()
+@click.argument("folders", metavar="SCENE_DIR...", nargs=-1, required=True, type=_FOLDER)
+@click.option("--preset", type=click.Choice(("street", "aerial")), default="aerial", show_default=True)
+@click.option("--json", "as_json", is_flag=True, help="Write everything as JSON.")
+@click.option("--markdown", type=click.Path(path_type=Path, dir_okay=False), help="Write the table to this file too.")
+def urb3dcd(folders: tuple[Path, ...], preset: str, as_json: bool, markdown: Path | None) -> None:
+    """Point-wise scores on Urb3DCD scenes: folders with pointCloud0.ply and pointCloud1.ply."""
+    from loda_pdal.benchmark.urb3dcd import run_scenes, to_markdown
+
+    _compile_kernels()
+    scores = run_scenes(folders, preset=preset, say=_say)
+    table = to_markdown(scores)
+    if markdown is not None:
+        markdown.write_text(table + "\n", encoding="utf-8")
+    click.echo(json.dumps({name: found.to_dict() for name, found in scores.items()}) if as_json else table)
+
+
+@bench.command(name="urb3dcd-export")
+@click.argument("block", metavar="BLOCK_DIR", type=_FOLDER)
+@click.argument("out", metavar="SCENE_DIR", type=click.Path(path_type=Path, file_okay=False))
+@click.option("--overwrite", is_flag=True, help="Replace a scene that is there already.")
+def urb3dcd_export(block: Path, out: Path, overwrite: bool) -> None:
+    """Write the simulated block in BLOCK_DIR as an Urb3DCD scene to SCENE_DIR."""
+    from loda_pdal.benchmark.urb3dcd import scene_of_block, write_scene
+
+    for path in write_scene(scene_of_block(block), out, overwrite=overwrite):
         click.echo(path)
 
 

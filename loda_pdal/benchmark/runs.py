@@ -89,7 +89,7 @@ def read_run(run_dir: Path, truth: Truth, truth_dir: Path) -> JudgedPoints:
     points = _points_of(cloud)
     if "TruthId" in set(cloud.point_format.dimension_names):
         truth_id = np.asarray(cloud["TruthId"]).astype(np.int64)
-        truth_change = _truth_change(cloud, truth_id, truth)
+        truth_change = truth_change_of(cloud, truth_id, truth)
         return _judged(points, truth_id, truth_change)
     parts = [
         _annotated(truth_dir / f"{name}.laz", code, truth, points.at(points.epoch == code))
@@ -170,7 +170,7 @@ def read_annotation(path: Path, truth: Truth) -> Annotation:
         )
     cloud = laspy.read(path)
     truth_id = np.asarray(cloud["TruthId"]).astype(np.int64)
-    return Annotation(np.column_stack([cloud.x, cloud.y, cloud.z]), truth_id, _truth_change(cloud, truth_id, truth))
+    return Annotation(np.column_stack([cloud.x, cloud.y, cloud.z]), truth_id, truth_change_of(cloud, truth_id, truth))
 
 
 def judged_result(result: ChangeResult, annotation: Pair[Annotation], T_after_before: FloatArray) -> JudgedPoints:
@@ -211,7 +211,7 @@ def _judged(points: Points, truth_id: Int64Array, truth_change: ByteArray) -> Ju
     return JudgedPoints(**said, truth_id=truth_id, truth_change=truth_change)
 
 
-def _truth_change(cloud: Any, truth_id: Int64Array, truth: Truth) -> ByteArray:
+def truth_change_of(cloud: Any, truth_id: Int64Array, truth: Truth) -> ByteArray:
     """Label of the surface of each point; that of its whole instance where the cloud does not say."""
     if "TruthChange" in set(cloud.point_format.dimension_names):
         return np.asarray(cloud["TruthChange"])

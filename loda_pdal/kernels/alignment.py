@@ -7,8 +7,8 @@ The twist (tx, ty, tz, rx, ry, rz) is applied about the origin of the frame, aft
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from loda_pdal.kernels.compiled import inner, kernel
 from loda_pdal.kernels.neighbours import k_nearest
 
 CHUNK = 2048
@@ -29,7 +29,7 @@ ROUNDING_M = 1e-9
 """More than distances are wrong by for rounding, m."""
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def plane_chunks(  # type: ignore[no-untyped-def]
     start, stop, source, source_normals, R, t, R_last, t_last, cells, target, normals, sq_sigma, radius, min_cosine,
     tau, is_robust, match, clearance, residual, weight, sums,
@@ -56,11 +56,11 @@ def plane_chunks(  # type: ignore[no-untyped-def]
     sums : (chunks, N_SUMS) float64
         Filled; ``SCORE`` is the weighted square sum of residuals and ``WEIGHT`` the weights without 1 / sigma^2.
     """
-    best_sq, best_idx = np.empty(2, dtype=np.float64), np.empty(2, dtype=np.int32)
-    J = np.empty(6, dtype=np.float64)
+    best_sq, best_idx, J = np.empty(2), np.empty(2, dtype=np.int32), np.empty(6)
     for chunk in range(start, stop):
         total = sums[chunk]
-        total[:] = 0.0
+        for s in range(N_SUMS):
+            total[s] = 0.0
         guess = min(cells.cell_m, radius)
         for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(source))):
             residual[i] = weight[i] = 0.0
@@ -92,7 +92,7 @@ def plane_chunks(  # type: ignore[no-untyped-def]
             total[SCORE] += tukey * r * r
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def distribution_chunks(start, stop, source, R, t, cells, distribution, radius, outlier, sums):  # type: ignore[no-untyped-def]
     """Point-to-distribution pairs of the source points in chunks [start, stop).
 
@@ -119,10 +119,11 @@ def distribution_chunks(start, stop, source, R, t, cells, distribution, radius, 
     near = np.empty(16 * N_SLOTS + 2 * len(cells.xyz), dtype=np.int32)
     within = np.empty(len(cells.xyz) + 1, dtype=np.int32)
     edge, x0, y0, z0 = cells.cell_m, cells.low[0], cells.low[1], cells.low[2]
-    n_near = 0
+    n_near = np.int64(0)
     for chunk in range(start, stop):
         total = sums[chunk]
-        total[:] = 0.0
+        for s in range(N_SUMS):
+            total[s] = 0.0
         for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(source))):
             x, y, z = _moved(R, t, source[i, 0], source[i, 1], source[i, 2])
             cx, cy, cz = int(np.floor((x - x0) / edge)), int(np.floor((y - y0) / edge)), int(np.floor((z - z0) / edge))
@@ -158,7 +159,7 @@ def distribution_chunks(start, stop, source, R, t, cells, distribution, radius, 
             _add_block(total, x, y, z, w * bx, w * by, w * bz, w * xx, w * xy, w * xz, w * yy, w * yz, w * zz)
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _fill_slot(cells, i, j, k, radius, slots, slot, near, n_near):  # type: ignore[no-untyped-def]
     """List the sorted points within ``radius`` of a cube. Cubes have the edge of the cells and begin where they do.
 
@@ -168,13 +169,14 @@ def _fill_slot(cells, i, j, k, radius, slots, slot, near, n_near):  # type: igno
     edge, low = cells.cell_m, cells.low
     if n_near + len(cells.xyz) > len(near):
         n_near = 0
-        slots[:, 4] = 0
+        for s in range(N_SLOTS):
+            slots[s, 4] = 0
     slots[slot, 0], slots[slot, 1], slots[slot, 2], slots[slot, 3] = i, j, k, n_near
     x, y, z = low[0] + (i + 0.5) * edge, low[1] + (j + 0.5) * edge, low[2] + (k + 0.5) * edge
     n = int(radius / edge) + 1
     for row in range(max(i - n, 0), min(i + n + 1, len(cells.row_start) - 1)):
         end = cells.row_start[row + 1]
-        first = _first_at_least(cells.column_y, cells.row_start[row], end, j - n)
+        first = _first_at_least(cells.column_y, np.int64(cells.row_start[row]), end, j - n)
         last = _first_at_least(cells.column_y, first, end, j + n + 1)
         for p in range(cells.column_start[first], cells.column_start[last]):
             dx = max(abs(cells.xyz[p, 0] - x) - 0.5 * edge, 0.0)
@@ -186,7 +188,7 @@ def _fill_slot(cells, i, j, k, radius, slots, slot, near, n_near):  # type: igno
     return n_near
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _first_at_least(values, a, b, least):  # type: ignore[no-untyped-def]
     """First of the ascending values [a, b) that is at least ``least``; b if none is."""
     while a < b:
@@ -198,26 +200,28 @@ def _first_at_least(values, a, b, least):  # type: ignore[no-untyped-def]
     return a
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def plane_blocks(xyz, normals, residual, weight, block, sums):  # type: ignore[no-untyped-def]
     """Point-to-plane pairs summed by block: ``block`` (k,) of each pair, points (k, 3) float64 after the pose, normals.
 
     ``sums`` (blocks, `N_SUMS`) is added to, in the order of the pairs.
     """
-    J = np.empty(6, dtype=np.float64)
+    J = np.empty(6)
     for i in range(len(xyz)):
         x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
         _fill_row(J, x, y, z, np.float64(normals[i, 0]), np.float64(normals[i, 1]), np.float64(normals[i, 2]))
         _add(sums[block[i]], J, weight[i], residual[i])
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def nearest_to_means(xyz, voxel, mean, kept):  # type: ignore[no-untyped-def]
     """Of the points (m, 3) of each voxel, the one nearest to its mean (v, 3); the first of equally near ones.
 
     ``kept`` (v,) int64 is filled with their indices; ``voxel`` (m,) int32 leaves none empty.
     """
-    best_sq = np.full(len(mean), np.inf)
+    best_sq = np.empty(len(mean))
+    for v in range(len(mean)):
+        best_sq[v] = np.inf
     for i in range(len(xyz)):
         v = voxel[i]
         sq = _sq_length(xyz[i, 0] - mean[v, 0], xyz[i, 1] - mean[v, 1], xyz[i, 2] - mean[v, 2])
@@ -225,7 +229,7 @@ def nearest_to_means(xyz, voxel, mean, kept):  # type: ignore[no-untyped-def]
             best_sq[v], kept[v] = sq, i
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def sum_products(xyz, voxel, mean, products):  # type: ignore[no-untyped-def]
     """Add the products xx, xy, xz, yy, yz, zz of each point's (m, 3) offset from its voxel's mean to (v, 6)."""
     for i in range(len(xyz)):
@@ -239,13 +243,13 @@ def sum_products(xyz, voxel, mean, products):  # type: ignore[no-untyped-def]
         products[v, 5] += z * z
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _moved(R, t, x, y, z):  # type: ignore[no-untyped-def]
     x, y, z = _turned(R, x, y, z)
     return x + t[0], y + t[1], z + t[2]
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _turned(R, x, y, z):  # type: ignore[no-untyped-def]
     return (
         R[0, 0] * x + R[0, 1] * y + R[0, 2] * z,
@@ -254,19 +258,19 @@ def _turned(R, x, y, z):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _sq_length(x, y, z):  # type: ignore[no-untyped-def]
     return x * x + y * y + z * z
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _fill_row(J, x, y, z, nx, ny, nz):  # type: ignore[no-untyped-def]
     """Row of the Jacobian of a point's distance along a normal: the normal, and its moment about the origin."""
     J[0], J[1], J[2] = nx, ny, nz
     J[3], J[4], J[5] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _add(total, J, w, r):  # type: ignore[no-untyped-def]
     """Add one residual with row ``J`` of the Jacobian."""
     k = 0
@@ -277,7 +281,7 @@ def _add(total, J, w, r):  # type: ignore[no-untyped-def]
         total[21 + a] += w * J[a] * r
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _add_block(total, x, y, z, bx, by, bz, xx, xy, xz, yy, yz, zz):  # type: ignore[no-untyped-def]
     """Add a 3D residual at (x, y, z) with Jacobian J = [I, -[p]x], given B and B d: J'BJ and J'Bd."""
     # rows of B [p]x, so that J'BJ = [[B, -B[p]x], [., [p]x' B [p]x]]

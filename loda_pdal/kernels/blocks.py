@@ -4,14 +4,14 @@ Queries are a cell list too, often that of the cloud itself. A block is a piece 
 wide; the points around it are copied once, coordinate by coordinate, and each query runs over these short arrays. A
 kernel of your own that visits all points within a radius reads::
 
-    @njit(nogil=True, cache=True)
+    @kernel
     def _count_range(start, stop, room, blocks, queries, cells, radius, counts):
         for block in range(start, stop):
             n = around(room, cells, box_of(queries, blocks[block], blocks[block + 1]), radius)
             if n < 0:
                 return block
             for q in range(blocks[block], blocks[block + 1]):
-                measure(room, n, queries.xyz[q, 0], queries.xyz[q, 1], queries.xyz[q, 2])
+                measure(room, n, queries, q)
                 counts[queries.idx[q]] = hits_within(room, n, radius * radius)
                 # room.idx[room.hit[h]] is the index of a point within the radius
         return stop
@@ -27,9 +27,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from loda_pdal.kernels.cells import CellList, cells_between, extent, first_above, first_column
+from loda_pdal.kernels.compiled import inner, kernel
 from loda_pdal.kernels.parallel import run_ranges
 
 POINTS_PER_COLUMN = 24
@@ -129,7 +129,7 @@ def _room_for(m: int, k: int) -> Room:
     )
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _find_blocks(xyz, column_start, height, starts):  # type: ignore[no-untyped-def]
     """Fill the first point of each block, and the number of points at the end; how many blocks."""
     n_blocks = first = 0
@@ -142,7 +142,7 @@ def _find_blocks(xyz, column_start, height, starts):  # type: ignore[no-untyped-
     return n_blocks
 
 
-@njit(nogil=True, cache=True)
+@inner
 def box_of(queries, start, stop):  # type: ignore[no-untyped-def]
     """Box around sorted queries [start, stop) of a block: x from, x to, y from, y to, z from, z to."""
     x0 = x1 = np.float64(queries.xyz[start, 0])
@@ -153,7 +153,7 @@ def box_of(queries, start, stop):  # type: ignore[no-untyped-def]
     return x0, x1, y0, y1, np.float64(queries.xyz[start, 2]), np.float64(queries.xyz[stop - 1, 2])
 
 
-@njit(nogil=True, cache=True)
+@inner
 def around(room, cells, box, radius):  # type: ignore[no-untyped-def]
     """Copy all points within ``radius`` of a box, and a few more; how many, -1 if there is not enough room."""
     x0, x1, y0, y1, z0, z1 = box
@@ -185,16 +185,16 @@ def around(room, cells, box, radius):  # type: ignore[no-untyped-def]
     return n
 
 
-@njit(nogil=True, cache=True)
-def measure(room, n, x, y, z):  # type: ignore[no-untyped-def]
-    """Fill the squared distances of the first ``n`` points from (x, y, z), float64."""
-    x, y, z = np.float64(x), np.float64(y), np.float64(z)
+@inner
+def measure(room, n, queries, q):  # type: ignore[no-untyped-def]
+    """Fill the squared distances of the first ``n`` points from sorted query ``q``, float64."""
+    x, y, z = np.float64(queries.xyz[q, 0]), np.float64(queries.xyz[q, 1]), np.float64(queries.xyz[q, 2])
     for j in range(n):
         dx, dy, dz = np.float64(room.x[j]) - x, np.float64(room.y[j]) - y, np.float64(room.z[j]) - z
         room.sq[j] = dx * dx + dy * dy + dz * dz
 
 
-@njit(nogil=True, cache=True)
+@inner
 def hits_within(room, n, sq_radius):  # type: ignore[no-untyped-def]
     """Fill ``room.hit`` with those of the first ``n`` points whose measured distance is within; how many."""
     n_hits = 0
@@ -204,7 +204,7 @@ def hits_within(room, n, sq_radius):  # type: ignore[no-untyped-def]
     return n_hits
 
 
-@njit(nogil=True, cache=True)
+@inner
 def nearest_of_block(room, queries, start, stop, cells, guess, max_distance):  # type: ignore[no-untyped-def]
     """Fill the nearest points of the queries [start, stop) of a block, those of the first query in the first row.
 
@@ -228,7 +228,7 @@ def nearest_of_block(room, queries, start, stop, cells, guess, max_distance):  #
             if room.n_nearest[row] >= 0:
                 continue
             q = start + row
-            measure(room, n, queries.xyz[q, 0], queries.xyz[q, 1], queries.xyz[q, 2])
+            measure(room, n, queries, q)
             n_found = _sort_hits(room, n, min(sq_expected, radius * radius), row)
             if n_found < k and sq_expected < radius * radius:
                 n_found = _sort_hits(room, n, radius * radius, row)
@@ -242,7 +242,7 @@ def nearest_of_block(room, queries, start, stop, cells, guess, max_distance):  #
     return max(min(1.1 * np.sqrt(sq_longest), 2 * guess), 0.25 * cells.cell_m)
 
 
-@njit(nogil=True, cache=True)
+@inner
 def distance_to_far_corner(cells, box):  # type: ignore[no-untyped-def]
     """At least as far, m, as any point is from any place in a box."""
     x0, x1, y0, y1, z0, z1 = box
@@ -252,12 +252,12 @@ def distance_to_far_corner(cells, box):  # type: ignore[no-untyped-def]
     return np.sqrt(dx * dx + dy * dy + dz * dz) * (1 + 1e-9)
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _sort_hits(room, n, sq_radius, row):  # type: ignore[no-untyped-def]
     """Fill a row with the nearest of the measured points within; how many there are."""
     n_hits = hits_within(room, n, sq_radius)
     _order_by_ring(room, n_hits, sq_radius)
-    n_found = 0
+    n_found = np.int64(0)
     for h in range(n_hits):
         j = room.order[h]
         n_found = insert(room.sq[j], room.idx[j], room.best_sq, room.best_idx, n_found)
@@ -266,7 +266,7 @@ def _sort_hits(room, n, sq_radius, row):  # type: ignore[no-untyped-def]
     return n_found
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _order_by_ring(room, n_hits, sq_radius):  # type: ignore[no-untyped-def]
     """Order the hits by rings of equal area, and so almost by distance: to insert them is then hardly any work."""
     scale = (len(room.ring) - 1.5) / max(sq_radius, 1e-300)
@@ -283,7 +283,7 @@ def _order_by_ring(room, n_hits, sq_radius):  # type: ignore[no-untyped-def]
         room.ring[r] += 1
 
 
-@njit(nogil=True, cache=True)
+@inner
 def insert(sq, idx, best_sq, best_idx, n_found):  # type: ignore[no-untyped-def]
     """Keep (sq, idx) if it is among the best, in order; how many there are now."""
     k = len(best_sq)

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from loda_pdal.kernels.compiled import inner, kernel
 
 Array = npt.NDArray[Any]
 
@@ -16,7 +17,7 @@ _MOST_CORNERS = 16
 """A rectangle cut by six half-spaces has at most ten corners."""
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def drop_inner_points(first: int, last: int, xy: Array, order: Array, starts: Array, label: Array) -> None:
     """Set the label of plan points to -1 that are surely no corners of the convex hull of their group.
 
@@ -31,7 +32,8 @@ def drop_inner_points(first: int, last: int, xy: Array, order: Array, starts: Ar
     east, north = (1.0, 1.0, 0.0, -1.0, -1.0, -1.0, 0.0, 1.0), (0.0, 1.0, 1.0, 1.0, 0.0, -1.0, -1.0, -1.0)
     reach, corner, side = np.empty(8), np.empty((8, 2)), np.empty((8, 2))
     for group in range(first, last):
-        reach[:] = -np.inf
+        for k in range(8):
+            reach[k] = -np.inf
         for t in range(starts[group], starts[group + 1]):
             x, y = xy[order[t], 0], xy[order[t], 1]
             for k in range(8):
@@ -53,7 +55,7 @@ def drop_inner_points(first: int, last: int, xy: Array, order: Array, starts: Ar
                 label[order[t]] = -1
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def smallest_rectangles(
     first: int, last: int, xy: Array, order: Array, starts: Array, centre: Array, along: Array, size: Array
 ) -> None:
@@ -71,7 +73,7 @@ def smallest_rectangles(
         n = starts[group + 1] - starts[group]
         if n == 0:
             continue
-        points = np.empty((n, 2), np.float64)
+        points = np.empty((n, 2))
         for t in range(n):
             points[t, 0] = xy[order[starts[group] + t], 0]
             points[t, 1] = xy[order[starts[group] + t], 1]
@@ -104,21 +106,21 @@ def smallest_rectangles(
                 size[group, 0], size[group, 1] = length, width
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _hull(points: Array) -> Array:
     """Corners of the convex hull of sorted (n, 2) points, counterclockwise from the lowest x (monotone chain)."""
     n = len(points)
-    hull = np.empty((2 * n + 1, 2), np.float64)
-    k = 0
+    hull = np.empty((2 * n + 1, 2))
+    k = none = np.int64(0)
     for t in range(n):
-        k = _push_corner(hull, k, 0, points[t])
+        k = _push_corner(hull, k, none, points[t])
     lower = k - 1
     for t in range(n - 2, -1, -1):
         k = _push_corner(hull, k, lower, points[t])
     return hull[: max(k - 1, 1)]
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _push_corner(hull: Array, k: int, fixed: int, point: Array) -> int:
     """Append a point to the chain of ``k`` corners, after those that no longer turn left; the new count."""
     while k - fixed >= 2:
@@ -131,7 +133,7 @@ def _push_corner(hull: Array, k: int, fixed: int, point: Array) -> int:
     return k + 1
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def shared_volumes(
     first: int,
     last: int,
@@ -158,23 +160,25 @@ def shared_volumes(
         volume[p] = max(0.5 * (one + two), 0.0)
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _shared(centre_a: Array, axes_a: Array, size_a: Array, centre_b: Array, axes_b: Array, size_b: Array) -> float:
     """Volume that boxes a and b share; a face that both have counts for a only."""
-    offset = centre_b - centre_a
-    sq_reach = 0.0
+    here, offset = np.empty(3), np.empty(3)
+    sq_reach = sq_a = sq_b = 0.0
     for d in range(3):
+        here[d], offset[d] = 0.0, centre_b[d] - centre_a[d]
         sq_reach += offset[d] * offset[d]
-    reach = 0.5 * (np.sqrt(np.sum(size_a * size_a)) + np.sqrt(np.sum(size_b * size_b)))
+        sq_a += size_a[d] * size_a[d]
+        sq_b += size_b[d] * size_b[d]
+    reach = 0.5 * (np.sqrt(sq_a) + np.sqrt(sq_b))
     if sq_reach > reach * reach:
         return 0.0
-    here = np.zeros(3)
     volume = _faces_inside(here, axes_a, size_a, offset, axes_b, size_b, _TOLERANCE_M)
     volume += _faces_inside(offset, axes_b, size_b, here, axes_a, size_a, -_TOLERANCE_M)
     return float(volume) / 3.0
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _faces_inside(
     centre: Array, axes: Array, size: Array, other_centre: Array, other_axes: Array, other_size: Array, slack: float
 ) -> float:
@@ -188,7 +192,7 @@ def _faces_inside(
     for axis in range(3):
         u, v = (axis + 1) % 3, (axis + 2) % 3
         for side in (-0.5, 0.5):
-            n = 4
+            n = np.int64(4)
             for corner in range(4):
                 along_u = 0.5 if corner == 1 or corner == 2 else -0.5
                 along_v = 0.5 if corner >= 2 else -0.5
@@ -214,7 +218,7 @@ def _faces_inside(
     return total
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _clip(polygon: Array, n: int, sign: float, axis: Array, centre: Array, limit: float, scratch: Array) -> int:
     """Cut a polygon in place to ``sign * axis . (p - centre) <= limit``; the new number of corners."""
     k = 0
@@ -239,7 +243,7 @@ def _clip(polygon: Array, n: int, sign: float, axis: Array, centre: Array, limit
     return k
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _area_along(polygon: Array, n: int, normal: Array) -> float:
     """Area of a plane convex polygon with a unit normal, whichever way round its corners go."""
     total = 0.0

@@ -6,7 +6,7 @@ about distances depends neither on the cell size nor on the number of threads.
 
 A kernel of your own that visits all points within a radius of a few queries reads::
 
-    @njit(nogil=True, cache=True)
+    @kernel
     def _count_range(start, stop, cells, queries, radius, counts):
         runs = empty_runs(cells, radius)
         for q in range(start, stop):
@@ -28,8 +28,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from loda_pdal.kernels.compiled import inner, kernel
 from loda_pdal.kernels.parallel import run_ranges
 
 MOST_CELLS_ALONG = 1 << 22
@@ -133,7 +133,7 @@ def _about(xyz: npt.NDArray[Any], centre: FloatArray) -> Float32Array:
     return np.ascontiguousarray(np.asarray(xyz, dtype=np.float64) - centre, dtype=np.float32)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _cell_range(start, stop, xyz, low, cell, cell_xy):  # type: ignore[no-untyped-def]
     """Cell along x and along y, (2, n) int32, of points [start, stop)."""
     for i in range(start, stop):
@@ -141,7 +141,7 @@ def _cell_range(start, stop, xyz, low, cell, cell_xy):  # type: ignore[no-untype
         cell_xy[1, i] = int(np.floor((xyz[i, 1] - low[1]) / cell))
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _sort_by(key, start, order, result):  # type: ignore[no-untyped-def]
     """Fill ``result`` with the indices ``order`` by their key; equal ones stay in order. ``start`` is all zeros."""
     for i in range(len(key)):
@@ -154,7 +154,7 @@ def _sort_by(key, start, order, result):  # type: ignore[no-untyped-def]
         start[key[i]] += 1
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _find_columns(cell_xy, idx, row_start, column_y, column_start):  # type: ignore[no-untyped-def]
     """Fill three arrays of a `CellList`, given the points by column; how many columns. ``row_start`` is all zeros."""
     n_columns, x, y = 0, -1, -1
@@ -172,7 +172,7 @@ def _find_columns(cell_xy, idx, row_start, column_y, column_start):  # type: ign
     return n_columns
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _sort_column_range(start, stop, column_start, xyz, xyz_bits, key, idx, sorted_xyz):  # type: ignore[no-untyped-def]
     """Sort the points of columns [start, stop) by height, then index: Shell sort of both in one integer."""
     for column in range(start, stop):
@@ -198,7 +198,7 @@ def _sort_column_range(start, stop, column_start, xyz, xyz_bits, key, idx, sorte
             sorted_xyz[p, 0], sorted_xyz[p, 1], sorted_xyz[p, 2] = xyz[i, 0], xyz[i, 1], xyz[i, 2]
 
 
-@njit(nogil=True, cache=True)
+@inner
 def sq_distance(cells, p, x, y, z):  # type: ignore[no-untyped-def]
     """Squared distance (m2, float64) of sorted point ``p`` from (x, y, z) in the frame of the cell list."""
     dx = np.float64(cells.xyz[p, 0]) - np.float64(x)
@@ -207,14 +207,14 @@ def sq_distance(cells, p, x, y, z):  # type: ignore[no-untyped-def]
     return dx * dx + dy * dy + dz * dz
 
 
-@njit(nogil=True, cache=True)
+@inner
 def empty_runs(cells, radius):  # type: ignore[no-untyped-def]
     """Room for the runs of any query of that radius, (r, 2) int32."""
     along = 2 * int(np.ceil(radius / cells.cell_m)) + 2
     return np.empty((min(along * along, len(cells.column_y)), 2), dtype=np.int32)
 
 
-@njit(nogil=True, cache=True)
+@inner
 def runs_within(cells, x, y, z, radius, runs):  # type: ignore[no-untyped-def]
     """Fill ``runs`` with [start, stop) of sorted points that hold all points within ``radius``; how many runs."""
     x, y, z = np.float64(x), np.float64(y), np.float64(z)
@@ -235,12 +235,12 @@ def runs_within(cells, x, y, z, radius, runs):  # type: ignore[no-untyped-def]
     return n_runs
 
 
-@njit(nogil=True, cache=True)
+@inner
 def cells_between(low, high, cell):  # type: ignore[no-untyped-def]
     return int(np.floor(low / cell)), int(np.floor(high / cell))
 
 
-@njit(nogil=True, cache=True)
+@inner
 def first_column(cells, row, first_y):  # type: ignore[no-untyped-def]
     """First column of a row whose y cell is at least ``first_y``."""
     a, b = cells.row_start[row], cells.row_start[row + 1]
@@ -253,7 +253,7 @@ def first_column(cells, row, first_y):  # type: ignore[no-untyped-def]
     return a
 
 
-@njit(nogil=True, cache=True)
+@inner
 def first_above(xyz, a, b, z, is_strict):  # type: ignore[no-untyped-def]
     """First of the sorted points [a, b) of a column that is at least ``z`` high, or higher where ``is_strict``."""
     while a < b:
@@ -265,7 +265,7 @@ def first_above(xyz, a, b, z, is_strict):  # type: ignore[no-untyped-def]
     return a
 
 
-@njit(nogil=True, cache=True)
+@inner
 def sq_gap_to_column(cells, row, column, x, y):  # type: ignore[no-untyped-def]
     """Squared distance in plan (m2) from (x, y) to a column, a hair too small rather than too large."""
     west = cells.low[0] + row * cells.cell_m

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from loda_pdal.kernels.cells import build_cells, empty_runs, runs_within, sq_distance
+from loda_pdal.kernels.compiled import inner, kernel
 from loda_pdal.kernels.parallel import run_ranges
 
 IntArray = npt.NDArray[np.int32]
@@ -117,19 +117,19 @@ def smooth_pieces(
     return parent
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _link(cells, radius, reach, index, parent):  # type: ignore[no-untyped-def]
     """Join points of the cell list within ``radius`` and, where given, both ``reach``; ``index`` is theirs in parent.
 
     The trees are grown in the order of the list, where neighbours stand close together, and then handed to ``parent``.
     """
     n = len(cells.xyz)
-    tree = np.arange(n, dtype=np.int32)
+    tree = np.empty(n, dtype=np.int32)
     runs = empty_runs(cells, radius)
     limit = radius
     for q in range(n):
         x, y, z = cells.xyz[q, 0], cells.xyz[q, 1], cells.xyz[q, 2]
-        root = q
+        tree[q] = root = q
         for r in range(runs_within(cells, x, y, z, radius, runs)):
             for p in range(runs[r, 0], min(runs[r, 1], q)):
                 if tree[p] == root:
@@ -139,10 +139,10 @@ def _link(cells, radius, reach, index, parent):  # type: ignore[no-untyped-def]
                 if sq_distance(cells, p, x, y, z) <= limit * limit:
                     root = _join(tree, root, p)
     for q in range(n):
-        _join(parent, index[cells.idx[q]], index[cells.idx[tree[q]]])
+        _join(parent, np.int64(index[cells.idx[q]]), np.int64(index[cells.idx[tree[q]]]))
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _core_range(start, stop, cells, weight, radius, least_weight, is_core):  # type: ignore[no-untyped-def]
     runs = empty_runs(cells, radius)
     for q in range(start, stop):
@@ -155,7 +155,7 @@ def _core_range(start, stop, cells, weight, radius, least_weight, is_core):  # t
         is_core[cells.idx[q]] = reached >= least_weight
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _border_range(start, stop, cells, xyz, is_core, radius, cluster):  # type: ignore[no-untyped-def]
     """Give points that are no core the cluster of the nearest one in reach."""
     runs = empty_runs(cells, radius)
@@ -176,7 +176,7 @@ def _border_range(start, stop, cells, xyz, is_core, radius, cluster):  # type: i
             cluster[own] = cluster[host]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _count_range(start, stop, cells, radius, enough, counts):  # type: ignore[no-untyped-def]
     runs = empty_runs(cells, radius)
     for q in range(start, stop):
@@ -190,13 +190,13 @@ def _count_range(start, stop, cells, radius, enough, counts):  # type: ignore[no
         counts[cells.idx[q]] = count
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _join_pairs(pairs, parent):  # type: ignore[no-untyped-def]
     for e in range(len(pairs)):
-        _join(parent, pairs[e, 0], pairs[e, 1])
+        _join(parent, np.int64(pairs[e, 0]), np.int64(pairs[e, 1]))
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _join_smooth(neighbour, normals, labels, least_cosine, parent):  # type: ignore[no-untyped-def]
     for i in range(len(neighbour)):
         for j in neighbour[i]:
@@ -206,10 +206,10 @@ def _join_smooth(neighbour, normals, labels, least_cosine, parent):  # type: ign
             for d in range(3):
                 cosine += np.float64(normals[i, d]) * np.float64(normals[j, d])
             if abs(cosine) > least_cosine:
-                _join(parent, i, j)
+                _join(parent, i, np.int64(j))
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _join(parent, a, b):  # type: ignore[no-untyped-def]
     """Join the trees of a and b; their common root."""
     a, b = _root(parent, a), _root(parent, b)
@@ -218,7 +218,7 @@ def _join(parent, a, b):  # type: ignore[no-untyped-def]
     return low
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _root(parent, a):  # type: ignore[no-untyped-def]
     while parent[a] != a:
         parent[a] = parent[parent[a]]
@@ -226,13 +226,13 @@ def _root(parent, a):  # type: ignore[no-untyped-def]
     return a
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _settle(parent):  # type: ignore[no-untyped-def]
     for a in range(len(parent)):
         parent[a] = _root(parent, a)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _numbered(parent):  # type: ignore[no-untyped-def]
     """Settled roots numbered in ascending order: a root is never behind its tree."""
     number = np.empty(len(parent), dtype=np.int32)

@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from loda_pdal.kernels.compiled import kernel
 
 Array = npt.NDArray[Any]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def contact_keys(neighbour: Array, labels: Array, n: int) -> Array:
     """One key for each neighbour relation between two labels.
 

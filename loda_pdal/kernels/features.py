@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from loda_pdal.kernels.blocks import around, box_of, hits_within, measure
+from loda_pdal.kernels.compiled import inner, kernel
 from loda_pdal.kernels.geometry import eigen_symmetric_3x3
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def shape_features(  # type: ignore[no-untyped-def]
     start, stop, room, blocks, cells, radius, min_neighbours, values, normals, is_valid
 ):
@@ -23,14 +23,14 @@ def shape_features(  # type: ignore[no-untyped-def]
             return block
         for q in range(blocks[block], blocks[block + 1]):
             x, y, z = np.float64(cells.xyz[q, 0]), np.float64(cells.xyz[q, 1]), np.float64(cells.xyz[q, 2])
-            measure(room, n, x, y, z)
+            measure(room, n, cells, q)
             n_hits = hits_within(room, n, radius * radius)
             if n_hits >= min_neighbours:
                 _shape(room, n_hits, x, y, z, 1e-12 * radius * radius, cells.idx[q], values, normals, is_valid)
     return stop
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _shape(room, n, x, y, z, smallest, i, values, normals, is_valid):  # type: ignore[no-untyped-def]
     """Write features at ``i``, of ``n`` hits around (x, y, z), unless these are all in one place."""
     sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0

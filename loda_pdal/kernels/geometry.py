@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
+from loda_pdal.kernels.compiled import inner, kernel
 
 _MAX_SWEEPS = 12
 _TOLERANCE = 1e-16
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _turn(pp: float, qq: float, pq: float) -> tuple[float, float, float]:
     """Tangent, cosine and sine of the rotation that makes the element ``pq`` of a symmetric matrix zero."""
     theta = (qq - pp) / (2.0 * pq)
@@ -19,7 +19,7 @@ def _turn(pp: float, qq: float, pq: float) -> tuple[float, float, float]:
     return tangent, cosine, tangent * cosine
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def eigen_symmetric_3x3(
     xx: float, xy: float, xz: float, yy: float, yz: float, zz: float
 ) -> tuple[float, float, float, float, float, float]:

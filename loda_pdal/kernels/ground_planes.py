@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from loda_pdal.kernels.compiled import inner, kernel
 from loda_pdal.kernels.parallel import run_ranges
 from loda_pdal.model.cloud import FloatArray, Int64Array
 
@@ -71,7 +71,7 @@ def fit_planes(
     return plane, n_inliers, n_raw_inliers
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _fit_range(  # type: ignore[no-untyped-def]
     first, last, xyz, n_raw, start, seed, cell_m, inlier_m, max_slope, iterations, plane, n_inliers, n_raw_inliers
 ):
@@ -107,7 +107,7 @@ def _fit_range(  # type: ignore[no-untyped-def]
         plane[c, 0], plane[c, 1], plane[c, 2] = h, gx, gy
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _draw(state, n):  # type: ignore[no-untyped-def]
     """Next state of the generator (SplitMix64) and a whole number below ``n``."""
     state = state + np.uint64(0x9E3779B97F4A7C15)
@@ -118,7 +118,7 @@ def _draw(state, n):  # type: ignore[no-untyped-def]
     return state, np.int64((z >> np.uint64(33)) % np.uint64(n))
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _through(xyz, i, j, k):  # type: ignore[no-untyped-def]
     """Whether three points span a plane that is not upright, and its h, gx, gy."""
     ux, uy, uz = xyz[j, 0] - xyz[i, 0], xyz[j, 1] - xyz[i, 1], xyz[j, 2] - xyz[i, 2]
@@ -131,7 +131,7 @@ def _through(xyz, i, j, k):  # type: ignore[no-untyped-def]
     return True, xyz[i, 2] - gx * xyz[i, 0] - gy * xyz[i, 1], gx, gy
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _cost(xyz, a, b, h, gx, gy, inlier_m, best):  # type: ignore[no-untyped-def]
     """Sum of squared distances, each at most inlier_m squared; stops early above ``best``."""
     limit = inlier_m * inlier_m
@@ -145,7 +145,7 @@ def _cost(xyz, a, b, h, gx, gy, inlier_m, best):  # type: ignore[no-untyped-def]
     return cost
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _refined(xyz, a, b, h, gx, gy, inlier_m, prior):  # type: ignore[no-untyped-def]
     """Least-squares plane of the inliers of a plane, its slope drawn to level by ``prior`` (m2)."""
     scale = 1.0 / np.sqrt(1.0 + gx * gx + gy * gy)
@@ -174,7 +174,7 @@ def _refined(xyz, a, b, h, gx, gy, inlier_m, prior):  # type: ignore[no-untyped-
     return mz - gx * mx - gy * my, gx, gy
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def blended_height_range(
     start: int,
     stop: int,

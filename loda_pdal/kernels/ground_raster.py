@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from loda_pdal.kernels.compiled import inner, kernel
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def cell_range(start, stop, xyz, cell_m, first, n_y, cell_idx):  # type: ignore[no-untyped-def]
     """Cell of points [start, stop), row by row: (i - first_x) * n_y + j - first_y; ``first`` (2,) int64."""
     for p in range(start, stop):
@@ -15,7 +16,7 @@ def cell_range(start, stop, xyz, cell_m, first, n_y, cell_idx):  # type: ignore[
         cell_idx[p] = i * n_y + j
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def lower_to(lowest, cell_idx, values):  # type: ignore[no-untyped-def]
     """Lower each cell (c,) to the least value (m,) in it."""
     for p in range(len(values)):
@@ -23,7 +24,7 @@ def lower_to(lowest, cell_idx, values):  # type: ignore[no-untyped-def]
             lowest[cell_idx[p]] = values[p]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def group_by_cell(cell_idx, place, order):  # type: ignore[no-untyped-def]
     """Fill ``order`` with the points (m,) by cell and index; ``place`` (c,), first place of each cell, moves on."""
     for p in range(len(cell_idx)):
@@ -31,7 +32,7 @@ def group_by_cell(cell_idx, place, order):  # type: ignore[no-untyped-def]
         place[cell_idx[p]] += 1
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def sort_range(first, last, start, xyz, order):  # type: ignore[no-untyped-def]
     """Sort points ``order[start[g]:start[g + 1]]`` of groups [first, last) by x, y, z and index (Shell's sort)."""
     for g in range(first, last):
@@ -49,7 +50,7 @@ def sort_range(first, last, start, xyz, order):  # type: ignore[no-untyped-def]
             gap //= 3
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _is_before(xyz, p, q):  # type: ignore[no-untyped-def]
     for axis in range(3):
         if xyz[p, axis] != xyz[q, axis]:
@@ -57,7 +58,7 @@ def _is_before(xyz, p, q):  # type: ignore[no-untyped-def]
     return p < q
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def relax(height, is_known, sweeps):  # type: ignore[no-untyped-def]
     """Replace the cells that are not known by the mean of their four neighbours, all at once, ``sweeps`` times.
 

@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from loda_pdal.kernels.compiled import inner, kernel
 
 Array = npt.NDArray[Any]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def sort_by_label(labels: Array, starts: Array, order: Array) -> None:
     """Counting sort of points by label.
 
@@ -37,7 +38,7 @@ def sort_by_label(labels: Array, starts: Array, order: Array) -> None:
             place[label] += 1
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def number_by_first(labels: Array, number_of: Array, number: Array) -> int:
     """Number labels 0, 1, 2, ... in the order of their first point, and return how many there are.
 
@@ -63,7 +64,7 @@ def number_by_first(labels: Array, number_of: Array, number: Array) -> int:
     return n
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def extremes_range(first: int, last: int, values: Array, order: Array, starts: Array, low: Array, high: Array) -> None:
     """Fill ``low`` and ``high``, (n, d) NaNs, with the extremes of ``values`` (m, d) float64; NaNs are left out."""
     for group in range(first, last):
@@ -76,7 +77,7 @@ def extremes_range(first: int, last: int, values: Array, order: Array, starts: A
                     high[group, column] = value
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def quantile_range(
     first: int, last: int, values: Array, order: Array, starts: Array, q: float, quantile: Array
 ) -> None:
@@ -86,7 +87,7 @@ def quantile_range(
     """
     picked = np.empty(_largest(first, last, starts))
     for group in range(first, last):
-        n = 0
+        n = np.int64(0)
         for t in range(starts[group], starts[group + 1]):
             picked[n] = values[order[t]]
             n += not np.isnan(picked[n])
@@ -95,12 +96,14 @@ def quantile_range(
         place = starts[group] + q * (n - 1)  # as if all groups stood sorted behind each other
         part = place - np.floor(place)
         low = int(np.floor(place)) - starts[group]
-        lower = _select(picked, n, low)
-        upper = lower if low + 1 == n else np.min(picked[low + 1 : n])
+        lower = select(picked, n, low)
+        upper = lower if low + 1 == n else np.inf
+        for t in range(low + 1, n):
+            upper = min(upper, picked[t])
         quantile[group] = lower * (1 - part) + upper * part
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _largest(first: int, last: int, starts: Array) -> int:
     """Points in the largest of the groups."""
     most = 0
@@ -109,8 +112,8 @@ def _largest(first: int, last: int, starts: Array) -> int:
     return most
 
 
-@njit(nogil=True, cache=True)
-def _select(values: Array, n: int, rank: int) -> float:
+@inner
+def select(values: Array, n: int, rank: int) -> float:
     """Value of that rank among the first ``n``, which are reordered: none before is larger, none behind smaller.
 
     Hoare's selection; pivots are drawn by a fixed generator, so that no order of the values makes it slow.

@@ -5,12 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy.typing as npt
-from numba import njit
+
+from loda_pdal.kernels.compiled import kernel
 
 Array = npt.NDArray[Any]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def find_range(first: int, last: int, cells: Array, low: Array, span: Array, sorted_keys: Array, place: Array) -> None:
     """Fill ``place`` (k,) int64 with where the keys of ``cells`` (k, d) stand, -1 where a cell has none.
 

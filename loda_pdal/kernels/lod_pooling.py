@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from loda_pdal.kernels.cells import empty_runs, runs_within, sq_distance
+from loda_pdal.kernels.compiled import inner, kernel
 from loda_pdal.kernels.geometry import eigen_symmetric_3x3
+from loda_pdal.kernels.groups import select
 from loda_pdal.kernels.planes import LINE
 
 MAD_TO_STD = 1.4826
@@ -16,7 +17,7 @@ TRIM = 3.0
 """Points farther than this many standard deviations from the median leave the mean offset."""
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def pool_range(  # type: ignore[no-untyped-def]
     start, stop, before, after, centres, radius, min_points, max_isotropy, n_points, normal, sigma, offset, is_valid
 ):
@@ -35,9 +36,15 @@ def pool_range(  # type: ignore[no-untyped-def]
         n_points[c, 0], n_points[c, 1] = n_b, n_a
         if n_b < min_points or n_a < min_points:
             continue
-        own_b, own_a = _covariance(points_b, n_b), _covariance(points_a, n_a)
-        mean = 0.5 * (own_b + own_a)
-        large, middle, small, nx, ny, nz = eigen_symmetric_3x3(mean[0], mean[1], mean[2], mean[3], mean[4], mean[5])
+        b, a = _covariance(points_b, n_b), _covariance(points_a, n_a)
+        large, middle, small, nx, ny, nz = eigen_symmetric_3x3(
+            0.5 * (b[0] + a[0]),
+            0.5 * (b[1] + a[1]),
+            0.5 * (b[2] + a[2]),
+            0.5 * (b[3] + a[3]),
+            0.5 * (b[4] + a[4]),
+            0.5 * (b[5] + a[5]),
+        )
         if middle <= LINE * large or small > max_isotropy * middle:
             continue
         normal[c, 0], normal[c, 1], normal[c, 2] = nx, ny, nz
@@ -46,7 +53,7 @@ def pool_range(  # type: ignore[no-untyped-def]
         is_valid[c] = True
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _gather(cells, x, y, z, radius, runs, points):  # type: ignore[no-untyped-def]
     """Points within ``radius``, about (x, y, z), in a buffer that is enlarged where needed; how many."""
     n_runs = runs_within(cells, x, y, z, radius, runs)
@@ -66,7 +73,7 @@ def _gather(cells, x, y, z, radius, runs, points):  # type: ignore[no-untyped-de
     return points, n
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _covariance(points, n):  # type: ignore[no-untyped-def]
     """xx, xy, xz, yy, yz, zz of the first ``n`` points about their mean."""
     mx, my, mz = 0.0, 0.0, 0.0
@@ -75,26 +82,25 @@ def _covariance(points, n):  # type: ignore[no-untyped-def]
         my += points[p, 1]
         mz += points[p, 2]
     mx, my, mz = mx / n, my / n, mz / n
-    total = np.zeros(6)
+    xx = xy = xz = yy = yz = zz = 0.0
     for p in range(n):
         x, y, z = points[p, 0] - mx, points[p, 1] - my, points[p, 2] - mz
-        total[0] += x * x
-        total[1] += x * y
-        total[2] += x * z
-        total[3] += y * y
-        total[4] += y * z
-        total[5] += z * z
-    return total / n
+        xx, xy, xz = xx + x * x, xy + x * y, xz + x * z
+        yy, yz, zz = yy + y * y, yz + y * z, zz + z * z
+    return xx / n, xy / n, xz / n, yy / n, yz / n, zz / n
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _offset_and_noise(points, n, nx, ny, nz):  # type: ignore[no-untyped-def]
     """Trimmed mean offset along the normal and its standard deviation from the MAD, both in m."""
-    along = np.empty(n)
+    along, room = np.empty(n), np.empty(n)
     for p in range(n):
         along[p] = points[p, 0] * nx + points[p, 1] * ny + points[p, 2] * nz
-    middle = np.median(along)
-    sigma = MAD_TO_STD * np.median(np.abs(along - middle))
+        room[p] = along[p]
+    middle = _median(room, n)
+    for p in range(n):
+        room[p] = abs(along[p] - middle)
+    sigma = MAD_TO_STD * _median(room, n)
     total, count = 0.0, 0
     for p in range(n):
         if abs(along[p] - middle) <= TRIM * sigma:
@@ -103,7 +109,19 @@ def _offset_and_noise(points, n, nx, ny, nz):  # type: ignore[no-untyped-def]
     return (total / count if count > 0 else middle), sigma
 
 
-@njit(nogil=True, cache=True)
+@inner
+def _median(values, n):  # type: ignore[no-untyped-def]
+    """Median of ``n`` values, which are reordered."""
+    upper = select(values, n, n // 2)
+    if n % 2:
+        return upper
+    lower = values[0]
+    for p in range(1, n // 2):
+        lower = max(lower, values[p])
+    return 0.5 * (lower + upper)
+
+
+@kernel
 def limit_range(start, stop, xyz, cells, cell_m, lod95, is_valid, otherwise, result):  # type: ignore[no-untyped-def]
     """Limits (m) at points [start, stop), linear between the valid ones of the eight cell centres around each.
 
@@ -142,7 +160,7 @@ def limit_range(start, stop, xyz, cells, cell_m, lod95, is_valid, otherwise, res
         result[p] = total / weight if weight > 1e-6 else otherwise
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _first_cell(cells, i, j, k):  # type: ignore[no-untyped-def]
     """First of the cells that does not come before (i, j, k)."""
     a, b = 0, len(cells)
@@ -155,7 +173,7 @@ def _first_cell(cells, i, j, k):  # type: ignore[no-untyped-def]
     return a
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _place_in_column(cells, first, i, j, k):  # type: ignore[no-untyped-def]
     """Which of the cells from ``first`` on is (i, j, k), at most two are asked; -1 if neither."""
     for c in range(first, min(first + 2, len(cells))):

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from loda_pdal.kernels.blocks import (
     block_edge,
@@ -30,6 +29,7 @@ from loda_pdal.kernels.cells import (
     sq_distance,
     sq_gap_to_column,
 )
+from loda_pdal.kernels.compiled import inner, kernel
 
 
 class NeighbourTable(NamedTuple):
@@ -106,7 +106,7 @@ def _like(cells: CellList, queries: npt.NDArray[Any]) -> CellList:
     return build_cells(queries, cells.cell_m, cells.centre)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _knn_range(  # type: ignore[no-untyped-def]
     start, stop, room, blocks, queries, cells, max_distance, includes_self, idx, distance
 ):
@@ -129,7 +129,7 @@ def _knn_range(  # type: ignore[no-untyped-def]
     return stop
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _mean_distance_range(start, stop, room, blocks, cells, mean):  # type: ignore[no-untyped-def]
     guess = cells.cell_m
     for block in range(start, stop):
@@ -147,7 +147,7 @@ def _mean_distance_range(start, stop, room, blocks, cells, mean):  # type: ignor
     return stop
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def k_nearest(cells, x, y, z, guess, max_distance, skip, best_sq, best_idx):  # type: ignore[no-untyped-def]
     """Fill ``best_*`` with the nearest points but ``skip``, by (squared distance, index); k is the length of them.
 
@@ -166,11 +166,11 @@ def k_nearest(cells, x, y, z, guess, max_distance, skip, best_sq, best_idx):  # 
     return n_found, max(min(reached, 2 * guess), 0.25 * cells.cell_m)
 
 
-@njit(nogil=True, cache=True)
+@inner
 def k_within(cells, x, y, z, radius, skip, best_sq, best_idx):  # type: ignore[no-untyped-def]
     """The k best of the points within ``radius``, by (distance, index), into ``best_*``; how many were found."""
     k = len(best_sq)
-    n_found = 0
+    n_found = np.int64(0)
     limit = radius * radius
     reach = radius * (1 + 1e-9)
     first_row, last_row = cells_between(x - reach - cells.low[0], x + reach - cells.low[0], cells.cell_m)

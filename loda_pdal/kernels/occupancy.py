@@ -7,10 +7,11 @@ Points are sorted by slot, two for each voxel: ``2 v`` holds the points that the
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from loda_pdal.kernels.compiled import kernel
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def holder_range(start, stop, starts, owner, n_raw, n, holder, n_held):  # type: ignore[no-untyped-def]
     """Object that has each slot [start, stop): the one with most raw points in it, the lowest of several.
 
@@ -43,7 +44,7 @@ def holder_range(start, stop, starts, owner, n_raw, n, holder, n_held):  # type:
         holder[slot], n_held[slot] = best, most
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def column_top_range(start, stop, columns, starts, owner, z, is_counted, n, column_owner, top):  # type: ignore[no-untyped-def]
     """Highest point that each object has in each of the columns [start, stop), by epoch.
 
@@ -61,7 +62,9 @@ def column_top_range(start, stop, columns, starts, owner, z, is_counted, n, colu
         One entry for each object in each column, in the places of the column's points; all else stays as it is.
         ``top`` is NaN in the epoch in which the object has no point there.
     """
-    entry = np.full(n, -1, dtype=np.int64)
+    entry = np.empty(n, dtype=np.int64)
+    for owned in range(n):
+        entry[owned] = -1
     for column in range(start, stop):
         first = starts[2 * columns[column]]
         last = first
@@ -82,7 +85,7 @@ def column_top_range(start, stop, columns, starts, owner, z, is_counted, n, colu
             entry[column_owner[e]] = -1
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def shared_column_range(start, stop, columns, holder, n, is_shared):  # type: ignore[no-untyped-def]
     """Which slots of the columns [start, stop) belong to an object that holds voxels of the column in both epochs.
 
@@ -97,12 +100,14 @@ def shared_column_range(start, stop, columns, holder, n, is_shared):  # type: ig
     is_shared : (c, 2) bool
         Filled.
     """
-    is_in = np.zeros((n + 1, 2), dtype=np.bool_)  # the last is none
+    is_in = np.empty((n + 1, 2), dtype=np.bool_)  # the last is none
+    for owned in range(n + 1):
+        is_in[owned, 0] = is_in[owned, 1] = False
     for column in range(start, stop):
         for epoch in range(2):
             for v in range(columns[column], columns[column + 1]):
                 is_in[holder[v, epoch], epoch] = True
-        is_in[n] = False
+        is_in[n, 0] = is_in[n, 1] = False
         for epoch in range(2):
             for v in range(columns[column], columns[column + 1]):
                 is_shared[v, epoch] = is_in[holder[v, epoch], 0] and is_in[holder[v, epoch], 1]

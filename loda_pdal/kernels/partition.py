@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from loda_pdal.kernels.compiled import inlined, inner, kernel
 
 Array = npt.NDArray[Any]
 
@@ -36,7 +37,7 @@ _MOST_VISITS = 8
 """How often a node is looked at in one sweep: a safety net, and a count rather than a clock."""
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def members(labels: Array, n_labels: int) -> tuple[Array, Array]:
     """Members of each label by counting sort: ``order`` (m,) int32, ascending in each label; ``start`` (n + 1,)."""
     start = np.zeros(n_labels + 1, np.int32)
@@ -52,7 +53,7 @@ def members(labels: Array, n_labels: int) -> tuple[Array, Array]:
     return order, start
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _widest(start: Array) -> int:
     """The largest number of members."""
     widest = 0
@@ -61,7 +62,7 @@ def _widest(start: Array) -> int:
     return widest
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def standardise(values: Array, is_known: Array, quantum: float, standard: Array) -> None:
     """Fill ``standard`` (m, 5) float32: zero mean and unit variance over the known rows, in multiples of ``quantum``.
 
@@ -87,7 +88,7 @@ def standardise(values: Array, is_known: Array, quantum: float, standard: Array)
             standard[i, d] = np.rint((values[i, d] - mean[d]) / spread[d] / quantum) * quantum
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def symmetric_arcs(neighbours: Array) -> tuple[Array, Array]:
     """Rows ``first_arc`` (m + 1,) and ``heads`` of the graph that joins i and j when either lists the other.
 
@@ -114,7 +115,9 @@ def symmetric_arcs(neighbours: Array) -> tuple[Array, Array]:
                 place[j] += 1
 
     first_arc = np.zeros(n + 1, np.int32)
-    met = np.full(n, -1, np.int32)  # the last node that met this one
+    met = np.empty(n, np.int32)  # the last node that met this one
+    for i in range(n):
+        met[i] = -1
     for i in range(n):
         n_arcs = first_lister[i + 1] - first_lister[i]
         for s in range(first_lister[i], first_lister[i + 1]):
@@ -141,7 +144,7 @@ def symmetric_arcs(neighbours: Array) -> tuple[Array, Array]:
     return first_arc, heads
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def sq_feature_distances(first_arc: Array, heads: Array, features: Array) -> Array:
     """Squared distance of the features at both ends of each arc, (a,) float32."""
     sq_distances = np.empty(len(heads), np.float32)
@@ -155,7 +158,7 @@ def sq_feature_distances(first_arc: Array, heads: Array, features: Array) -> Arr
     return sq_distances
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def rank_bits(bits: Array, rank: int) -> int:
     """The value of this rank among (a,) non-negative int32: counts by the upper half, then by the lower one.
 
@@ -168,7 +171,8 @@ def rank_bits(bits: Array, rank: int) -> int:
     while n_below + counts[high] <= rank:
         n_below += counts[high]
         high += 1
-    counts[:] = 0
+    for half in range(len(counts)):
+        counts[half] = 0
     for value in bits:
         counts[value & 0xFFFF] += value >> 16 == high
     low = 0
@@ -178,7 +182,7 @@ def rank_bits(bits: Array, rank: int) -> int:
     return high << 16 | low
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def connected_labels(first_arc: Array, heads: Array, labels: Array) -> tuple[Array, int]:
     """Labels split into connected regions, numbered in the order of their lowest node, and how many there are.
 
@@ -211,7 +215,7 @@ def connected_labels(first_arc: Array, heads: Array, labels: Array) -> tuple[Arr
     return lower, n_regions
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def contract(first_arc: Array, heads: Array, weights: Array, labels: Array, total: Array) -> tuple[Array, Array, Array]:
     """The graph whose nodes are the labels: arc weights are summed, arcs inside a label vanish; O(arcs).
 
@@ -247,7 +251,7 @@ def contract(first_arc: Array, heads: Array, weights: Array, labels: Array, tota
     return new_first, new_heads[:n_arcs], new_weights[:n_arcs]
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _select(values: Array, n: int, k: int) -> float:
     """The k-th smallest of ``values[:n]``, which is reordered (quickselect).
 
@@ -278,7 +282,7 @@ def _select(values: Array, n: int, k: int) -> float:
     return values[k]  # type: ignore[no-any-return]
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _median_and_deviation(values: Array, n: int) -> tuple[float, float]:
     """Lower median of ``values[:n]`` (reordered) and the sum of the absolute deviations from it."""
     median = _select(values, n, (n - 1) // 2)
@@ -288,7 +292,7 @@ def _median_and_deviation(values: Array, n: int) -> tuple[float, float]:
     return median, deviation
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _gather(features: Array, voxels: Array, low: int, high: int, columns: Array, at: int) -> None:
     """Copy the features of ``voxels[low:high]`` into ``columns`` (5, n) from column ``at`` on."""
     for t in range(low, high):
@@ -296,7 +300,7 @@ def _gather(features: Array, voxels: Array, low: int, high: int, columns: Array,
             columns[d, at + t - low] = features[voxels[t], d]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def fit_regions(
     features: Array, order: Array, start: Array, is_stale: Array, medians: Array, deviations: Array
 ) -> None:
@@ -305,12 +309,12 @@ def fit_regions(
     for region in range(len(is_stale)):
         if is_stale[region]:
             low, high = start[region], start[region + 1]
-            _gather(features, order, low, high, columns, 0)
+            _gather(features, order, low, high, columns, np.int64(0))
             for d in range(N_FEATURES):
                 medians[region, d], deviations[region, d] = _median_and_deviation(columns[d], high - low)
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _least_deviation(
     n: int, node_medians: Array, node_deviations: Array, i: int, medians: Array, label: int
 ) -> tuple[float, bool]:
@@ -329,7 +333,7 @@ def _least_deviation(
     return total, is_same
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _deviation(features: Array, order: Array, low: int, high: int, medians: Array, label: int, limit: float) -> float:
     """Sum of absolute deviations of the voxels ``order[low:high]`` from a label's medians; stops at ``limit``."""
     total = 0.0
@@ -342,7 +346,7 @@ def _deviation(features: Array, order: Array, low: int, high: int, medians: Arra
     return total
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _refit_labels(
     features: Array, order: Array, start: Array, labels: Array, is_stale: Array, medians: Array, is_shifted: Array
 ) -> None:
@@ -361,7 +365,7 @@ def _refit_labels(
         is_stale[label] = False
         if size[label] == 0:
             continue
-        n = 0
+        n = np.int64(0)
         for s in range(node_start[label], node_start[label + 1]):
             low, high = start[node_order[s]], start[node_order[s] + 1]
             _gather(features, order, low, high, columns, n)
@@ -374,7 +378,7 @@ def _refit_labels(
         is_shifted[label] = shift > _SHIFT
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def move_nodes(
     first_arc: Array,
     heads: Array,
@@ -419,8 +423,9 @@ def move_nodes(
         n_unused += 1
     near_label = np.empty(1 + _widest(first_arc), np.int32)  # its own label first
     near_weight = np.zeros(n)  # weight towards each label; 0 but for the node in hand
-    is_stale = np.zeros(n, np.bool_)
-    is_shifted = np.ones(n, np.bool_)
+    is_stale, is_shifted = np.empty(n, np.bool_), np.empty(n, np.bool_)
+    for label in range(n):
+        is_stale[label], is_shifted[label] = False, True
     queue = np.empty(n + 1, np.int32)  # a ring
     visits = np.empty(n, np.uint8)  # how often a node was looked at in this sweep, `_QUEUED` added while it waits
 
@@ -489,13 +494,13 @@ def move_nodes(
             break
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _shift_cost(n: float, spread: float, shift: float) -> float:
     """Estimated rise of a region's absolute deviation when its median is replaced by one ``shift`` away."""
     return n * (math.sqrt(shift * shift + spread * spread) - spread)
 
 
-@njit(nogil=True, cache=True, inline="always")  # a call would take three times as long
+@inlined  # a call would take three times as long
 def _least_merge_cost(n_a: float, n_b: float, medians: Array, deviations: Array, a: int, b: int) -> float:
     """Lower bound of `_merge_cost`, without roots: sqrt(shift^2 + spread^2) is at least the shift."""
     are_similar = 1.0 if max(n_a, n_b) < 3.0 * min(n_a, n_b) else 0.0
@@ -508,7 +513,7 @@ def _least_merge_cost(n_a: float, n_b: float, medians: Array, deviations: Array,
     return cost
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _merge_cost(start: Array, medians: Array, deviations: Array, a: int, b: int) -> float:
     """Estimated rise of the deviation when regions a and b merge; exact for two voxels.
 
@@ -532,7 +537,7 @@ def _merge_cost(start: Array, medians: Array, deviations: Array, a: int, b: int)
     return cost
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def find_voxel_partners(
     first_arc: Array,
     heads: Array,
@@ -555,7 +560,7 @@ def find_voxel_partners(
         partner[a], partner_gain[a], partner_weight[a] = best, best_gain, best_weight
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def find_partners(
     first_arc: Array,
     heads: Array,
@@ -601,7 +606,7 @@ def find_partners(
         partner[a], partner_gain[a], partner_weight[a] = best, best_gain, best_weight
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def merge_partners(
     features: Array,
     order: Array,
@@ -635,7 +640,7 @@ def merge_partners(
             n_a, n_b = start[a + 1] - start[a], start[b + 1] - start[b]
             rise = 0.0
             if n_a + n_b > 2:
-                _gather(features, order, start[a], start[a + 1], columns, 0)
+                _gather(features, order, start[a], start[a + 1], columns, np.int64(0))
                 _gather(features, order, start[b], start[b + 1], columns, n_a)
             for d in range(N_FEATURES):
                 if n_a + n_b > 2:
@@ -655,7 +660,7 @@ def merge_partners(
     return n_labels
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def carry_partners(
     old_partner: Array,
     old_weight: Array,
@@ -672,7 +677,7 @@ def carry_partners(
         partner_gain[labels[a]] = old_gain[a]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def closest_neighbours(
     first_arc: Array, heads: Array, weights: Array, medians: Array, is_asked: Array, neighbour: Array
 ) -> None:

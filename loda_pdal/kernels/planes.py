@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from loda_pdal.kernels.blocks import nearest_of_block
+from loda_pdal.kernels.compiled import inner, kernel
 from loda_pdal.kernels.geometry import eigen_symmetric_3x3
 
 LINE = 1e-3
 """Middle over largest eigenvalue below which the points lie on a line, which has no normal."""
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def plane_range(  # type: ignore[no-untyped-def]
     start, stop, room, blocks, cells, local, radius, min_neighbours, max_isotropy, normals, roughness
 ):
@@ -57,7 +57,7 @@ def plane_range(  # type: ignore[no-untyped-def]
     return stop
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _plane(local, idx, row, n):  # type: ignore[no-untyped-def]
     """Mean, eigenvalues of the scatter matrix and normal of the points in a row of ``idx``."""
     x = y = z = 0.0
@@ -75,7 +75,7 @@ def _plane(local, idx, row, n):  # type: ignore[no-untyped-def]
     return x, y, z, large, middle, small, nx, ny, nz
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def mad_sigma(values, n, ordered, place):  # type: ignore[no-untyped-def]
     """Robust standard deviation of the first ``n`` values, 1.4826 * median of absolute deviations from the median.
 
@@ -97,7 +97,7 @@ def mad_sigma(values, n, ordered, place):  # type: ignore[no-untyped-def]
     return 1.4826 * (deviation if n % 2 else 0.5 * (last + deviation))
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _sort(values, n, ordered, place):  # type: ignore[no-untyped-def]
     """The first ``n`` values in order: each goes where there are so many smaller ones, which needs no branches."""
     for j in range(n):

@@ -5,12 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy.typing as npt
-from numba import njit
+
+from loda_pdal.kernels.compiled import kernel
 
 Array = npt.NDArray[Any]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def highest_range(first: int, last: int, surface: Array, reach: int, highest: Array) -> None:
     """Find the highest cell around each cell of rows ``first`` to ``last``.
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from loda_pdal.kernels.compiled import inner, kernel
 from loda_pdal.model.cloud import BoolArray, FloatArray, IntArray
 
 LEAF_SIZE = 4
@@ -14,7 +14,7 @@ _MAX_DEPTH = 64
 _SMALLEST_T = 1e-6
 
 
-@njit(nogil=True, cache=True)
+@inner
 def hit_triangle(o: FloatArray, d: FloatArray, p: FloatArray) -> float:
     """Distance along the ray to triangle ``p`` = (corner, edge 1, edge 2), (9,); infinity where missed.
 
@@ -40,7 +40,7 @@ def hit_triangle(o: FloatArray, d: FloatArray, p: FloatArray) -> float:
     return t if t > _SMALLEST_T else np.inf
 
 
-@njit(nogil=True, cache=True)
+@inner
 def hit_disc(o: FloatArray, d: FloatArray, p: FloatArray) -> float:
     """Distance along the ray to disc ``p`` = (centre, normal, radius, 0, 0), (9,); infinity where missed."""
     slope = d[0] * p[3] + d[1] * p[4] + d[2] * p[5]
@@ -54,7 +54,7 @@ def hit_disc(o: FloatArray, d: FloatArray, p: FloatArray) -> float:
     return t if rx * rx + ry * ry + rz * rz <= p[6] * p[6] else np.inf
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _enter_box(o: FloatArray, inverse: FloatArray, box: FloatArray, t_max: float) -> float:
     """Distance at which the ray enters ``box`` = (low, high), (6,); infinity where it does not before ``t_max``."""
     near, far = 0.0, t_max
@@ -66,7 +66,7 @@ def _enter_box(o: FloatArray, inverse: FloatArray, box: FloatArray, t_max: float
     return near if near <= far else np.inf
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def nearest_hits(
     start: int,
     stop: int,

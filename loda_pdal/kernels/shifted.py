@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from loda_pdal.kernels.compiled import kernel
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def find_shifted(keys, shift):  # type: ignore[no-untyped-def]
     """Place (k,) int32 of each key plus ``shift`` among the ascending distinct ``keys`` (k,) int64; -1 where none."""
-    place = np.full(len(keys), -1, dtype=np.int32)
+    place = np.empty(len(keys), dtype=np.int32)
     j = 0
     for i in range(len(keys)):
         while j < len(keys) and keys[j] < keys[i] + shift:
             j += 1
-        if j < len(keys) and keys[j] == keys[i] + shift:
-            place[i] = j
+        place[i] = j if j < len(keys) and keys[j] == keys[i] + shift else -1
     return place
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def spread(keys, shift):  # type: ignore[no-untyped-def]
     """Ascending distinct keys, each plus and minus ``shift``, and these themselves: ascending and distinct again."""
     n = len(keys)

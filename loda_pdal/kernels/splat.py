@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from loda_pdal.kernels.compiled import inner, kernel
 
 NOTHING = np.float32(-1e6)
 """Depth where no point is drawn, m."""
@@ -12,7 +13,7 @@ _LEVEL, _STEEPEST = np.float32(0.0), np.float32(1.5)
 _DARKNESS = np.float32(-0.16)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def splat(u, v, depth, tone, u0, v0, pixel_m, dot, nearest, colour):  # type: ignore[no-untyped-def]
     """Draw points as dots where they are nearest; of equally near ones the brightest is seen, so order is no matter.
 
@@ -46,7 +47,7 @@ def splat(u, v, depth, tone, u0, v0, pixel_m, dot, nearest, colour):  # type: ig
                         nearest[i, j], colour[i, j] = near, light
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def shade(nearest, colour, first, n_shades, picture):  # type: ignore[no-untyped-def]
     """Paint what was drawn over a picture, darker where neighbours stand nearer to the viewer (eye-dome lighting).
 
@@ -80,7 +81,7 @@ def shade(nearest, colour, first, n_shades, picture):  # type: ignore[no-untyped
                 picture[i, j] = first + int(min(max(step, 0.0), n_shades - 1.0))
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _add_steps(here, beside, hidden):  # type: ignore[no-untyped-def]
     """Add to ``hidden`` how much nearer each pixel of one row is than that of another, 0 to `_STEEPEST`."""
     for j in range(len(here)):

@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
+
+from loda_pdal.kernels.compiled import inner, kernel
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def voxel_key_range(start: int, stop: int, xyz: Any, leaf: float, low: Any, n_y: int, n_z: int, key: Any) -> None:
     """Keys of points [start, stop).
 
@@ -31,7 +32,7 @@ def voxel_key_range(start: int, stop: int, xyz: Any, leaf: float, low: Any, n_y:
         key[p] = (i * n_y + j) * n_z + k
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def number_distinct(key: Any, first: int, table: Any, distinct: Any, n_distinct: int, number: Any) -> tuple[int, int]:
     """Number distinct keys in the order in which they appear, until the hash table is half full.
 
@@ -64,7 +65,7 @@ def number_distinct(key: Any, first: int, table: Any, distinct: Any, n_distinct:
     return len(key), n_distinct
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def add_points(number: Any, xyz: Any, total: Any, count: Any) -> None:
     """Add points to the sums of their voxels.
 
@@ -86,14 +87,14 @@ def add_points(number: Any, xyz: Any, total: Any, count: Any) -> None:
         count[v] += 1
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def fill_table(table: Any, distinct: Any, n_distinct: int) -> None:
     """Enter the first ``n_distinct`` of ``distinct`` into an empty hash table."""
     for d in range(n_distinct):
         table[_slot_of(distinct[d], table, distinct)] = d
 
 
-@njit(nogil=True, cache=True)
+@inner
 def _slot_of(key: int, table: Any, distinct: Any) -> int:
     """The slot that holds the key, or the free slot where it belongs."""
     mask = len(table) - 1

@@ -19,9 +19,11 @@ from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams, ConfidenceParams, ObservabilityParams
 from loda_pdal.stages.confidence import calibrated, raw_confidence
 from loda_pdal.stages.correspondence import rank_by_place
-from loda_pdal.stages.cues import Evidence, Surface, Voxels, cells_with_owners, sample_voxels, weigh
+from loda_pdal.stages.cues import Cells, Evidence, Surface, Voxels, cells_with_owners, sample_voxels, weigh
 from loda_pdal.stages.observability import Coverage
 from loda_pdal.stages.parts import Parts, dissolve, largest_regions, split_parts
+from loda_pdal.stages.things import split_things
+from loda_pdal.stages.vehicles import looks_like_vehicle, roughness, shape_change
 
 
 @dataclass(frozen=True)
@@ -102,20 +104,32 @@ def decide_changes(
     seen = coverage if observability.is_enabled or params.visible_only else None
     voxels = sample_voxels(surfaces, seen, lod, params)
     n = len(object_class)
-    cast = _Cast(surfaces, object_class, np.full(n, -1, dtype=np.int32), np.zeros(n, np.bool_)).settled(voxels)
-    cells = cells_with_owners(voxels, cast.surfaces, len(cast), params)
+    no = np.zeros(n, np.bool_)
+    cast = _Cast(surfaces, object_class, np.full(n, -1, dtype=np.int32), no, no, no).settled(voxels)
+    cells = cast.cells(voxels, params)
     evidence = weigh(cells, cast.surfaces, len(cast), params)
-    regions = largest_regions(cells, len(cast), params)
-    is_no_pair = np.array([_is_no_pair(cue, params) for cue in _rows(evidence, cast.object_class, regions)], np.bool_)
-    if is_no_pair.any():
-        cast = cast.without_pairs(is_no_pair).settled(voxels)
-        cells = cells_with_owners(voxels, cast.surfaces, len(cast), params)
+    cues = _rows(evidence, cast.object_class, largest_regions(cells, len(cast), params))
+    is_within = np.array([_is_within(cue, params) for cue in cues], dtype=np.bool_)
+    is_no_pair = np.array([_is_no_pair(cue, params) for cue in cues], dtype=np.bool_) & ~is_within
+    is_no_pair |= _is_replaced(cast, cues, voxels.at_points(cells.is_seen.swapped, cast.surfaces), params)
+    if is_no_pair.any() or is_within.any():
+        cast = cast.without_pairs(is_no_pair)
+        cast = cast.without_surroundings(is_within, voxels.at_points(cells.is_near.swapped, cast.surfaces))
+        cast = cast.settled(voxels)
+        cells = cast.cells(voxels, params)
+    if params.thing_voxels > 0:
+        is_vehicle = (cast.object_class == ObjectClass.MOBILE) & looks_like_vehicle(cast.surfaces, len(cast))
+        is_asked = cast.is_pair & (cast.object_class != ObjectClass.BUILDING) & ~is_vehicle
+        owner, host = split_things(cells, cast.surfaces, is_asked, params)
+        cast = cast.with_more(owner, host).settled(voxels)
+        cells = cast.cells(voxels, params)
     if params.find_parts:
         cast = cast.with_parts(split_parts(cells, cast.surfaces, cast.object_class, params)).settled(voxels)
-        cells = cells_with_owners(voxels, cast.surfaces, len(cast), params)
+        cells = cast.cells(voxels, params)
     evidence = weigh(cells, cast.surfaces, len(cast), params)
     regions = largest_regions(cells, len(cast), params)
     surfaces, object_class, parent, is_apart = cast.surfaces, cast.object_class, cast.parent, cast.is_apart
+    carrier = np.append(cast.is_house, False)[parent] & cast.is_extension
     cues = _rows(evidence, object_class, regions)
     verdicts = [
         _verdict(cue, apart, part, params, observability)
@@ -127,6 +141,9 @@ def decide_changes(
             for cue, v, apart in zip(cues, verdicts, is_apart.tolist(), strict=True)
         ]
     )
+    for i, part in _changed_houses(verdicts, parent, carrier, evidence.dv).items():
+        verdicts[i] = Verdict(verdicts[part].label, f"a part of it changed: {verdicts[part].reason}")
+        raw[i] = raw[part]
     sure = [calibrated(score, v.label, confidence) for score, v in zip(raw.tolist(), verdicts, strict=True)]
     label = np.array([v.label for v in verdicts], dtype=np.uint8)
     is_known = label != ChangeLabel.UNDETERMINED
@@ -144,31 +161,73 @@ def decide_changes(
 
 @dataclass(frozen=True)
 class _Cast:
-    """The objects as they stand: who owns which point, of which class, part of whom, and whether a pair was undone."""
+    """The objects as they stand: who owns which point, of which class, part of whom, whether a pair was undone, and
+    whether it is a house, which what is built onto it changes, or built onto one."""
 
     surfaces: Pair[Surface]
     object_class: ByteArray
     parent: IntArray
     is_apart: BoolArray
+    is_house: BoolArray
+    is_extension: BoolArray
 
     def __len__(self) -> int:
         return len(self.object_class)
 
+    def cells(self, voxels: Voxels, params: ChangeParams) -> Cells:
+        """The voxels with their owners; all but vegetation is solid."""
+        is_solid = (self.object_class != ObjectClass.VEGETATION) & params.needs_sight
+        return cells_with_owners(voxels, self.surfaces, len(self), params, is_solid)
+
     def without_pairs(self, is_no_pair: BoolArray) -> _Cast:
         """The before and the after side of the marked objects as objects of their own."""
         owner, partner = dissolve(self.surfaces.map(lambda side: side.owner), is_no_pair, len(self))
+        apart = self.with_more(owner, partner)
+        return replace(apart, is_apart=apart.is_apart | is_no_pair[np.concatenate([np.arange(len(self)), partner])])
+
+    def without_surroundings(self, is_within: BoolArray, is_shared: Pair[BoolArray]) -> _Cast:
+        """Of the marked objects (k,) keep what both epochs show; the rest is an object of its own."""
+        number = np.full(len(self) + 1, -1, dtype=np.int32)
+        inner = np.flatnonzero(is_within)
+        number[inner] = len(self) + np.arange(len(inner), dtype=np.int32)
+        owner = self.surfaces.join(
+            is_shared,
+            lambda side, shared: np.where(~shared & (number[side.owner] >= 0), number[side.owner], side.owner),
+        )
+        return self.with_more(owner, inner)
+
+    def with_more(self, owner: Pair[IntArray], like: IntArray) -> _Cast:
+        """Other owners, and behind the objects there are as many more as ``like`` (t,) names, of their kind."""
+        each = np.concatenate([np.arange(len(self)), like])
         return _Cast(
             self.surfaces.join(owner, Surface.owned_by),
-            np.concatenate([self.object_class, self.object_class[partner]]),
-            np.concatenate([self.parent, self.parent[partner]]),
-            np.concatenate([self.is_apart | is_no_pair, np.ones(len(partner), np.bool_)]),
+            self.object_class[each],
+            self.parent[each],
+            self.is_apart[each],
+            self.is_house[each],
+            self.is_extension[each],
         )
+
+    @property
+    def is_pair(self) -> BoolArray:
+        """Which objects (n,) both epochs have."""
+        before, after = (np.isin(np.arange(len(self)), side.owner) for side in self.surfaces)
+        return before & after
 
     def with_parts(self, parts: Parts) -> _Cast:
         """Parts as objects of their parents' class."""
-        whole = np.where(parts.parent >= 0, parts.parent, np.arange(len(parts.parent)))
+        whole = np.arange(len(parts.parent))
+        for _ in range(2):  # a part of a house, that of a row
+            whole = np.where(parts.parent[whole] >= 0, parts.parent[whole], whole)
         surfaces = self.surfaces.join(parts.owner, Surface.owned_by)
-        return _Cast(surfaces, self.object_class[whole], parts.parent, self.is_apart[whole])
+        return _Cast(
+            surfaces,
+            self.object_class[whole],
+            parts.parent,
+            self.is_apart[whole],
+            parts.is_house,
+            parts.is_extension,
+        )
 
     def settled(self, voxels: Voxels) -> _Cast:
         """Objects numbered by place, none without a voxel of its own.
@@ -204,6 +263,8 @@ class _Cast:
             self.object_class[kept],
             np.asarray(number[self.parent[kept]], dtype=np.int32),
             self.is_apart[kept],
+            self.is_house[kept],
+            self.is_extension[kept],
         )
 
 
@@ -260,6 +321,14 @@ def _rows(evidence: Evidence, object_class: ByteArray, regions: Pair[FloatArray]
     ]
 
 
+def _is_within(cue: Cue, params: ChangeParams) -> bool:
+    """Whether what one epoch shows stands in the midst of what the other shows: a lamp post where a tree was planted."""
+    supports = cue.support_before, cue.support_after
+    is_plain = cue.object_class in (ObjectClass.VEGETATION, ObjectClass.OTHER)
+    is_pair = cue.is_before and cue.is_after
+    return params.within_share > 0 and is_plain and is_pair and min(supports) < params.within_share <= max(supports)
+
+
 def _is_no_pair(cue: Cue, params: ChangeParams) -> bool:
     """A matched building or tree whose overlap or shift is beyond the paper's bounds is two objects."""
     if not (cue.is_before and cue.is_after):
@@ -268,10 +337,20 @@ def _is_no_pair(cue: Cue, params: ChangeParams) -> bool:
         return cue.iou <= params.building_iou or (cue.shift >= params.building_shift_m and _is_apart(cue, params))
     if cue.object_class == ObjectClass.VEGETATION:
         return cue.iou <= params.vegetation_iou or (cue.shift >= params.vegetation_shift_m and _is_apart(cue, params))
-    if cue.object_class == ObjectClass.MOBILE and params.replaced_m > 0:
-        is_elsewhere = cue.d_typical > params.replaced_m / 2 or min(cue.support_before, cue.support_after) < 0.8
-        return abs(cue.dh) > params.replaced_m and is_elsewhere
     return False
+
+
+def _is_replaced(cast: _Cast, cues: list[Cue], is_open: Pair[BoolArray], params: ChangeParams) -> BoolArray:
+    """Which vehicles stand where another one stood."""
+    is_pair = np.array([cue.is_before and cue.is_after for cue in cues], dtype=np.bool_)
+    is_asked = is_pair & (cast.object_class == ObjectClass.MOBILE) & (params.replaced_m > 0)
+    is_asked &= looks_like_vehicle(cast.surfaces, len(cast))
+    off = shape_change(cast.surfaces, is_open, is_asked)
+    return np.asarray(off > np.fmax(params.replaced_m, _ROUGH * roughness(cast.surfaces, is_asked)))
+
+
+_ROUGH = 1.2
+"""A shape must be off by more than this many times its own roughness."""
 
 
 def _is_apart(cue: Cue, params: ChangeParams) -> bool:
@@ -285,7 +364,7 @@ def _verdict(
     """Label of one object; ``is_apart``: it was matched, but the pair turned out to be two objects."""
     if not (cue.is_before and cue.is_after):
         alone = _unmatched(cue, is_apart, params, observability)
-        return _part_alone(cue, alone, params) if is_part and cue.object_class == ObjectClass.BUILDING else alone
+        return _extension(cue, alone, params) if is_part and cue.object_class == ObjectClass.BUILDING else alone
     if observability.is_enabled and cue.observability < observability.min_observability:
         return Verdict(
             ChangeLabel.UNDETERMINED,
@@ -294,43 +373,63 @@ def _verdict(
         )
     if cue.object_class == ObjectClass.MOBILE:
         return _mobile(cue, params)
-    if is_part and (verdict := _new_part(cue, params)):
-        return verdict
+    if is_part and (new := _new_part(cue, params)):
+        return new
     return _pair(cue, params)
-
-
-def _part_alone(cue: Cue, verdict: Verdict, params: ChangeParams) -> Verdict:
-    """A part of a building that one survey alone shows is its growth or loss, unless it is as large as a building."""
-    volume = max(cue.volume_before, cue.volume_after)
-    if params.part_is_new_m3 == 0 or volume >= params.part_is_new_m3:
-        return verdict
-    if verdict.label == ChangeLabel.ADDED:
-        return Verdict(ChangeLabel.INCREASED, f"{volume:.0f} m3 built on: {verdict.reason}")
-    if verdict.label == ChangeLabel.REMOVED:
-        return Verdict(ChangeLabel.DECREASED, f"{volume:.0f} m3 taken away: {verdict.reason}")
-    return verdict
 
 
 def _new_part(cue: Cue, params: ChangeParams) -> Verdict | None:
     """A part of which the other survey has next to nothing: one house of a row, one of several plants, came or went."""
-    is_green = cue.object_class == ObjectClass.VEGETATION
-    large = max(cue.volume_before, cue.volume_after)
-    least_m3 = 0.0 if is_green and params.plant_width_m > 0 else params.part_is_new_m3
-    if large < least_m3 or not (is_green or cue.object_class == ObjectClass.BUILDING) or params.part_is_new_m3 == 0:
+    is_plant = cue.object_class == ObjectClass.VEGETATION and params.plant_width_m > 0
+    if not is_plant and (cue.object_class != ObjectClass.BUILDING or params.part_is_new_m3 == 0):
         return None
-    for label, own, volume, other in (
-        (ChangeLabel.ADDED, cue.gained, cue.volume_after, "before"),
-        (ChangeLabel.REMOVED, cue.lost, cue.volume_before, "after"),
+    large = max(cue.volume_before, cue.volume_after)
+    if not is_plant and large < params.part_is_new_m3:
+        return None
+    for label, own, volume, theirs, other in (
+        (ChangeLabel.ADDED, cue.gained, cue.volume_after, cue.volume_before, "before"),
+        (ChangeLabel.REMOVED, cue.lost, cue.volume_before, cue.volume_after, "after"),
     ):
-        shown = volume - own * params.voxel_m**3
-        if volume == large and shown <= _NEXT_TO_NOTHING * large:
-            what = "a plant among others" if is_green else "building in a row"
+        # bodies are within reach of the bodies beside them
+        shown, most = (
+            (volume - own * params.voxel_m**3, _WITHIN_REACH) if params.fills_buildings else (theirs, _NEXT_TO_NOTHING)
+        )
+        if volume == large and shown <= most * large:
+            what = "a plant among others" if is_plant else "building in a row"
             return Verdict(label, f"{large:.0f} m3 of {what}, of which the {other} survey shows {shown:.0f} m3")
     return None
 
 
-_NEXT_TO_NOTHING = 0.4
-"""Share of a part's volume that may lie within reach of its neighbours."""
+def _extension(cue: Cue, verdict: Verdict, params: ChangeParams) -> Verdict:
+    """A part that one survey lacks altogether, smaller than a building, is a change of the building."""
+    volume = max(cue.volume_before, cue.volume_after)
+    if volume >= params.part_is_new_m3:
+        return verdict
+    if verdict.label == ChangeLabel.ADDED:
+        return Verdict(ChangeLabel.INCREASED, f"{volume:.0f} m3 built onto the building: {verdict.reason}")
+    if verdict.label == ChangeLabel.REMOVED:
+        return Verdict(ChangeLabel.DECREASED, f"{volume:.0f} m3 of the building taken away: {verdict.reason}")
+    return verdict
+
+
+def _changed_houses(
+    verdicts: list[Verdict], parent: IntArray, is_of_house: BoolArray, dv: FloatArray
+) -> dict[int, int]:
+    """Houses that are Unchanged but for a part, and the part that changed most of each."""
+    found: dict[int, int] = {}
+    for part in np.lexsort((np.arange(len(parent)), np.abs(dv))).tolist():
+        house = int(parent[part])
+        is_changed = verdicts[part].label in (ChangeLabel.INCREASED, ChangeLabel.DECREASED)
+        if is_of_house[part] and is_changed and verdicts[house].label == ChangeLabel.UNCHANGED:
+            found[house] = part
+    return found
+
+
+_NEXT_TO_NOTHING = 0.2
+"""Share of a part's volume that may be its neighbours' walls."""
+
+_WITHIN_REACH = 0.4
+"""Share of a body's volume that may lie within reach of its neighbours."""
 
 
 def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: ObservabilityParams) -> Verdict:
@@ -385,10 +484,15 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
         dh = cue.column_rise  # most of the roof moved, if not its highest part
     has_height = params.use_height and abs(dh) > max(gate, height_m)  # NaN is never above
     has_volume = params.use_volume and abs(cue.dv_ratio) > ratio
-    is_raised = least == 0 or cue.gained_above >= least_above or cue.column_rise > height_m / 2
-    is_lowered = least == 0 or cue.lost_above >= least_above or cue.column_rise < -height_m / 2
+    is_raised = least == 0 or cue.gained_above >= least_above or cue.column_rise > max(gate, height_m / 2)
+    is_lowered = least == 0 or cue.lost_above >= least_above or cue.column_rise < -max(gate, height_m / 2)
     rises = has_height and dh > 0 and is_raised
     sinks = has_height and dh < 0 and is_lowered
+    if params.fills_buildings and cue.object_class == ObjectClass.BUILDING:
+        # edges of roofs come and go with the sampling: a body changed where a piece of it did, or most of its roof
+        is_solid = max(cue.grown_m3, cue.cut_m3) > 0
+        has_volume &= is_solid
+        has_height &= is_solid or abs(cue.column_rise) > max(gate, height_m)
     noise = params.volume_sigmas * math.sqrt(cue.gained + cue.lost)
     has_volume = has_volume and abs(cue.gained - cue.lost) >= noise
     swells = has_volume and cue.dv_ratio > 0 and (least == 0 or cue.gained >= max(least, cue.lost))

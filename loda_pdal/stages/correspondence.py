@@ -4,6 +4,9 @@ The paper assigns instances of one class to each other one by one. Segmentation 
 instance in one survey and three in the other, a hedge is vegetation here and `other` there. So an instance that the
 assignment leaves over, but whose surface the other survey shows too, joins the object that occupies the same space
 (METHOD 2b); only what occupies space of its own can be Added or Removed.
+
+And where it is of another kind than that object (a bin that one survey shows beside a vehicle and the other in one piece
+with it), the object gives up the points that belong to it instead: the survey that tells things apart is right.
 """
 
 from __future__ import annotations
@@ -14,9 +17,9 @@ import numpy as np
 
 from loda_pdal.kernels.clusters import components
 from loda_pdal.kernels.neighbours import nearest
-from loda_pdal.model.cloud import ByteArray, FloatArray, IntArray
+from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, IntArray
 from loda_pdal.model.groups import Groups
-from loda_pdal.model.labels import OBJECT_CLASSES
+from loda_pdal.model.labels import OBJECT_CLASSES, ObjectClass
 from loda_pdal.model.pair import Pair
 from loda_pdal.params import AssociationParams
 from loda_pdal.stages.association import Descriptors, Matches, associate
@@ -39,12 +42,15 @@ class Objects:
         Instance pairs (0-based, before and after) that the assignment accepted.
     support : Pair of (o,) float64
         Share of each instance's voxels that have a surface of the other epoch's instances in reach.
+    owner : Pair of (m,) int32
+        Object of each voxel, -1 where it belongs to no instance: that of its instance, but for what was merged.
     """
 
     of_instance: Pair[IntArray]
     object_class: ByteArray
     matched: IntArray
     support: Pair[FloatArray]
+    owner: Pair[IntArray]
 
     def __len__(self) -> int:
         return len(self.object_class)
@@ -83,23 +89,39 @@ def match_instances(
         _shared_space(*bodies.before, n_before, *bodies.after, n_after, reach_m),
         _shared_space(*bodies.after, n_after, *bodies.before, n_before, reach_m),
     )
-    only_before = _left_over(votes.before, pairs[:, 0])
-    only_after = _left_over(votes.after, pairs[:, 1])
+    left = Pair(_left_over(votes.before, pairs[:, 0]), _left_over(votes.after, pairs[:, 1]))
+    is_apart = left.map(lambda side: np.zeros(len(side), np.bool_))
+    if params.splits_merged:
+        kinds = instances.map(lambda side: side.object_class)
+        is_apart = Pair(
+            _stands_apart(left.before, votes, kinds), _stands_apart(left.after, votes.swapped, kinds.swapped)
+        )
+    joined = left.join(is_apart, lambda side, apart: side[~apart])
+    apart = left.join(is_apart, lambda side, is_one: side[is_one])
     joins = [
         pairs + np.array([0, n_before]),
-        np.column_stack([only_before, votes.before.partner[only_before] + n_before]),
-        np.column_stack([votes.after.partner[only_after], only_after + n_before]),
+        np.column_stack([joined.before, votes.before.partner[joined.before] + n_before]),
+        np.column_stack([votes.after.partner[joined.after], joined.after + n_before]),
     ]
-    component = components(np.concatenate(joins).astype(np.int64), n_before + len(instances.after))
-    return _numbered(xyz, instances, component, pairs, votes)
+    component = components(np.concatenate(joins).astype(np.int64), n_before + n_after)
+    of_instance = Pair(component[:n_before], component[n_before:])
+    owner = Pair(
+        _owners(instances.before, of_instance, votes, apart.after),
+        _owners(instances.after, of_instance.swapped, votes.swapped, apart.before),
+    )
+    return _numbered(xyz, instances, of_instance, owner, pairs, votes)
 
 
 @dataclass(frozen=True)
 class _Votes:
-    """For each instance: share of voxels near any instance of the other epoch, and the one nearest to most of them."""
+    """For each instance: share of voxels near any instance of the other epoch, and the one nearest to most of them.
+
+    ``nearest`` (k,) is the instance of the other epoch, 0-based, that is nearest to each point, -1 none in reach.
+    """
 
     support: FloatArray
     partner: IntArray
+    nearest: IntArray
 
 
 def _assign_by_class(instances: Pair[Instances], descriptors: Pair[Descriptors], params: AssociationParams) -> IntArray:
@@ -147,15 +169,15 @@ def _shared_space(
     xyz: FloatArray, instance: IntArray, n: int, other_xyz: FloatArray, other: IntArray, n_others: int, reach_m: float
 ) -> _Votes:
     """Votes of the points of instances 1 to ``n`` for those of the other epoch, 1 to ``n_others``."""
-    support, partner = np.zeros(n), np.full(n, -1, np.int32)
+    support, partner, nearest_of = np.zeros(n), np.full(n, -1, np.int32), np.full(len(xyz), -1, np.int32)
     if len(xyz) == 0 or len(other_xyz) == 0:
-        return _Votes(support, partner)
+        return _Votes(support, partner, nearest_of)
     found, _ = nearest(other_xyz, xyz, reach_m)
     own = instance - 1
     points = np.maximum(np.bincount(own, minlength=n), 1)
     is_near = found >= 0
     support = np.bincount(own[is_near], minlength=n) / points
-    theirs = other[found[is_near]] - 1
+    nearest_of[is_near] = theirs = other[found[is_near]] - 1
     key, votes = np.unique(own[is_near].astype(np.int64) * n_others + theirs, return_counts=True)
     own_of, theirs_of = np.divmod(key, n_others)
     order = np.lexsort((theirs_of, -votes, own_of))
@@ -163,7 +185,7 @@ def _shared_space(
     is_first[1:] = own_of[order][1:] != own_of[order][:-1]
     best = order[is_first]
     partner[own_of[best]] = theirs_of[best]
-    return _Votes(support, partner)
+    return _Votes(support, partner, nearest_of)
 
 
 def _left_over(votes: _Votes, matched: IntArray) -> IntArray:
@@ -173,13 +195,45 @@ def _left_over(votes: _Votes, matched: IntArray) -> IntArray:
     return np.flatnonzero(is_free & (votes.support >= _MIN_SHARED) & (votes.partner >= 0)).astype(np.int32)
 
 
+def _stands_apart(left: IntArray, votes: Pair[_Votes], kinds: Pair[ByteArray]) -> BoolArray:
+    """Which of the instances left over are things of their own, merged with something else in the other epoch.
+
+    Not those of the same kind as the instance that occupies their space (crowns and houses are taken apart at will), and
+    not those that occupy each other's space: they are one thing with two names.
+    """
+    host = votes.before.partner[left]
+    is_mutual = (votes.after.partner[host] == left) & (votes.after.support[host] >= _MIN_SHARED)
+    kind, of_host = kinds.before[left], kinds.after[host]
+    is_same = (kind == of_host) & np.isin(kind, (ObjectClass.BUILDING, ObjectClass.VEGETATION))
+    return np.asarray(~is_same & ~is_mutual)
+
+
+def _owners(instances: Instances, of_instance: Pair[IntArray], votes: Pair[_Votes], apart: IntArray) -> IntArray:
+    """Object (m,) of each voxel, -1 none: that of its instance, or of the thing that the other epoch shows ``apart``.
+
+    ``of_instance`` and ``votes`` are of this epoch and the other.
+    """
+    table = np.concatenate([np.array([-1], dtype=np.int32), of_instance.before])
+    owner = table[instances.instance].astype(np.int32)
+    member = np.flatnonzero(instances.instance > 0)
+    host = np.full(len(of_instance.after) + 1, -1, dtype=np.int32)
+    host[apart] = votes.after.partner[apart]
+    nearest_of = votes.before.nearest[: len(member)]
+    is_given = (nearest_of >= 0) & (host[nearest_of] == instances.instance[member] - 1)
+    owner[member[is_given]] = of_instance.after[nearest_of[is_given]]
+    return owner
+
+
 def _numbered(
-    xyz: Pair[FloatArray], instances: Pair[Instances], component: IntArray, pairs: IntArray, votes: Pair[_Votes]
+    xyz: Pair[FloatArray],
+    instances: Pair[Instances],
+    of_instance: Pair[IntArray],
+    owner: Pair[IntArray],
+    pairs: IntArray,
+    votes: Pair[_Votes],
 ) -> Objects:
-    n_before = len(instances.before)
-    n = int(component.max()) + 1 if len(component) else 0
-    of_instance = Pair(component[:n_before], component[n_before:])
-    rank = rank_by_place(xyz, instances.join(of_instance, owners), n)
+    n = max((int(side.max()) + 1 for side in of_instance if len(side)), default=0)
+    rank = rank_by_place(xyz, owner, n)
     of_instance = of_instance.map(lambda side: rank[side])
     votes_per_class = np.zeros((n, 256), dtype=np.int64)
     for side, own in zip(of_instance, instances, strict=True):
@@ -187,13 +241,8 @@ def _numbered(
         np.add.at(votes_per_class, (side, own.object_class), voxels)
     priority = np.array(OBJECT_CLASSES, dtype=np.uint8)
     object_class = priority[np.argmax(votes_per_class[:, priority], axis=1)] if n else np.zeros(0, np.uint8)
-    return Objects(of_instance, object_class, pairs, votes.map(lambda side: side.support))
-
-
-def owners(instances: Instances, of_instance: IntArray) -> IntArray:
-    """Object (m,) of each voxel of an epoch, -1 where it belongs to no instance."""
-    table = np.concatenate([np.array([-1], dtype=np.int32), of_instance])
-    return np.asarray(table[instances.instance], dtype=np.int32)
+    owner = owner.map(lambda side: np.append(rank, np.int32(-1))[side])
+    return Objects(of_instance, object_class, pairs, votes.map(lambda side: side.support), owner)
 
 
 def rank_by_place(xyz: Pair[FloatArray], owner: Pair[IntArray], n: int) -> IntArray:

@@ -85,6 +85,8 @@ class Voxels:
         Whether that epoch has a surface within the query radius of the centre.
     is_covered : Pair of (c,) bool
         Whether that epoch saw the voxel's column.
+    is_over : Pair of (c,) bool
+        Whether that epoch has a return in the voxel's column beneath the voxel: its rays went in there.
     normal : (c, 3) float64
         Mean unit normal of both epochs' nearest surfaces, of either sign; zero where either surface is missing.
     displacement : (c,) float64, m
@@ -101,6 +103,7 @@ class Voxels:
     is_open: BoolArray
     is_near: Pair[BoolArray]
     is_covered: Pair[BoolArray]
+    is_over: Pair[BoolArray]
     normal: FloatArray
     displacement: FloatArray
     lod95: FloatArray
@@ -125,9 +128,17 @@ class Voxels:
 
     def on_points(self, holder: IntArray, surfaces: Pair[Surface]) -> Pair[IntArray]:
         """The object that has the voxel of each point of either epoch, -1 for points without object."""
+        return self._spread(holder, surfaces, np.int32(-1))
+
+    def at_points(self, values: Pair[BoolArray], surfaces: Pair[Surface]) -> Pair[BoolArray]:
+        """What is true (c,) of the voxel of each point of either epoch; false for points without object."""
+        return self._spread(np.column_stack(list(values)), surfaces, np.bool_(False))
+
+    def _spread(self, values: npt.NDArray[Any], surfaces: Pair[Surface], none: Any) -> Pair[npt.NDArray[Any]]:
+        """Values (c, 2) of the slots on the points of either epoch, ``none`` on points without object."""
         n_before = len(surfaces.before.owner)
-        spread = np.full(n_before + len(surfaces.after.owner), -1, dtype=np.int32)
-        spread[self.point] = np.repeat(holder.ravel(), np.diff(self.starts))
+        spread = np.full(n_before + len(surfaces.after.owner), none)
+        spread[self.point] = np.repeat(values.ravel(), np.diff(self.starts))
         return Pair(spread[:n_before], spread[n_before:])
 
 
@@ -142,15 +153,19 @@ class Cells:
     owner : Pair of (c,) int32
         Object whose points occupy the voxel in that epoch, -1 where none.
     is_seen : Pair of (c,) bool
-        Whether that epoch saw the voxel's column, and would have hit what the other epoch shows there.
+        Whether that epoch saw the voxel's column, and would have hit what the other epoch shows there; of solid things
+        it must show something beneath the voxel, and nothing of the same object above it.
     is_measured : Pair of (c,) bool
         Whether that epoch's owner has raw points there: not in what was filled in beneath a roof.
+    odds : Pair of (c,) float64
+        How likely that epoch's sampling was to meet what the other epoch shows there; 1 where that is not weighed.
     """
 
     voxels: Voxels
     owner: Pair[IntArray]
     is_seen: Pair[BoolArray]
     is_measured: Pair[BoolArray]
+    odds: Pair[FloatArray]
 
     @property
     def is_near(self) -> Pair[BoolArray]:
@@ -283,21 +298,65 @@ def sample_voxels(
         is_open=np.concatenate(list(is_open))[order],
         is_near=found.map(lambda idx: idx >= 0),
         is_covered=coverage.map(lambda side: side.at(centre)) if coverage else Pair(always, always),
+        is_over=surfaces.map(lambda surface: _is_over(centre, cell, columns, surface.xyz, params.voxel_m)),
         normal=normal,
         displacement=displacement,
         lod95=lod.at(centre),
     )
 
 
-def cells_with_owners(voxels: Voxels, surfaces: Pair[Surface], n: int, params: ChangeParams) -> Cells:
-    """The voxels with their owners among objects 0 to ``n - 1``."""
+def cells_with_owners(
+    voxels: Voxels, surfaces: Pair[Surface], n: int, params: ChangeParams, is_solid: BoolArray | None = None
+) -> Cells:
+    """The voxels with their owners among objects 0 to ``n - 1``.
+
+    Of those that are solid, (n,) bool, what has other surface of the object above it in the other epoch, or no return of
+    that epoch beneath it, was hidden there and not seen: a wall behind a new porch has not gone.
+    """
     holder, points = voxels.holders(surfaces, n)
     owner, n_raw = (Pair(*np.ascontiguousarray(values.T)) for values in (holder, points))
     is_seen = voxels.is_covered
+    expected = _expected_points(owner, n_raw, n)
     if params.min_expected_points > 0:
-        expected = _expected_points(owner, n_raw, n)
         is_seen = is_seen.join(expected, lambda seen, points: seen & (points >= params.min_expected_points))
-    return Cells(voxels, owner, is_seen, n_raw.map(lambda points: points > 0))
+    odds = expected.map(lambda points: 1.0 - np.exp(-points) if params.weighs_sampling else np.ones(len(points)))
+    if is_solid is not None and is_solid.any():
+        own = Pair(owner.after, owner.before)  # what each epoch should have seen is the other's
+        is_hidden = Pair(
+            ~voxels.is_over.before | _is_beneath(voxels, own.before, owner.before),
+            ~voxels.is_over.after | _is_beneath(voxels, own.after, owner.after),
+        )
+        solid = own.map(lambda side: np.append(is_solid, False)[side])
+        is_seen = is_seen.join(solid.join(is_hidden, np.logical_and), lambda seen, hidden: seen & ~hidden)
+    return Cells(voxels, owner, is_seen, n_raw.map(lambda points: points > 0), odds)
+
+
+def _is_over(centre: FloatArray, cell: Int64Array, columns: Int64Array, xyz: FloatArray, voxel_m: float) -> BoolArray:
+    """Whether any of the points (m, 3) lies in the column of each voxel (c,), beneath its centre."""
+    first = columns[:-1]
+    if len(first) == 0 or len(xyz) == 0:
+        return np.zeros(len(cell), np.bool_)
+    plan = cell[first, :2]
+    lattice = Lattice.around(plan)
+    column = lattice.find(lattice.keys(plan), cells_of(xyz[:, :2], voxel_m))
+    lowest = np.fmin(Groups(column, len(first)).minimum(xyz[:, 2]), np.inf)
+    return np.asarray(np.repeat(lowest, np.diff(columns)) < centre[:, 2])
+
+
+def _is_beneath(voxels: Voxels, owner: IntArray, other: IntArray) -> BoolArray:
+    """Whether the owner (c,) of each voxel has a voxel as high or higher in its column among ``other`` (c,) owners."""
+    column = np.repeat(np.arange(len(voxels.columns) - 1), np.diff(voxels.columns))
+    n = int(max(owner.max(initial=-1), other.max(initial=-1))) + 2
+    key = column * n + other
+    is_held = np.flatnonzero(other >= 0)
+    # voxels of a column ascend: the last of a key is its highest
+    keys, last = np.unique(key[is_held][::-1], return_index=True)
+    highest = is_held[len(is_held) - 1 - last]
+    place = np.minimum(np.searchsorted(keys, column * n + owner), max(len(keys) - 1, 0))
+    if len(keys) == 0:
+        return np.zeros(len(owner), np.bool_)
+    is_found = (keys[place] == column * n + owner) & (owner >= 0)
+    return np.asarray(is_found & (voxels.cell[highest[place], 2] >= voxels.cell[:, 2]))
 
 
 def _slots(cells: Pair[Int64Array]) -> tuple[Int64Array, Int64Array, Int64Array, Int64Array]:
@@ -346,7 +405,8 @@ def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -
         _count(own.before, cells.is_measured.before & cells.is_near.after, n),
         _count(own.after, cells.is_measured.after & cells.is_near.before, n),
     )
-    gained, lost = _count(own.after, cells.is_gained, n), _count(own.before, cells.is_lost, n)
+    gained = _count(own.after, cells.is_gained, n, cells.odds.before)
+    lost = _count(own.before, cells.is_lost, n, cells.odds.after)
     voxel, owner = _either(cells)
     compared = n_known if params.visible_only else n_voxels
     volume = compared.map(lambda count: count * params.voxel_m**3)
@@ -386,18 +446,19 @@ def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -
         dv_ratio=np.divide(dv, base, out=np.full(n, np.nan), where=base > 0),
         d_perp=np.where(is_sampled, samples.median(displacement), np.nan),
         d_typical=np.where(is_sampled, samples.median(np.abs(displacement)), np.nan),
-        gained_above=_count(own.after, cells.is_gained & _is_above(z, own.after, summit.before), n),
-        lost_above=_count(own.before, cells.is_lost & _is_above(z, own.before, summit.after), n),
-        column_rise=_column_rise(columns, n),
+        gained_above=_count(own.after, cells.is_gained & _is_above(z, own.after, summit.before), n, cells.odds.before),
+        lost_above=_count(own.before, cells.is_lost & _is_above(z, own.before, summit.after), n, cells.odds.after),
+        column_rise=_column_rise(voxels, surfaces, n),
         lod95=Groups(owner, n).median(voxels.lod95[voxel]),
         observability=(n_known.before + n_known.after) / np.maximum(n_voxels.before + n_voxels.after, 1),
         rise=_rise(cells, n),
     )
 
 
-def _count(owner: IntArray, is_counted: BoolArray, n: int) -> FloatArray:
-    """Voxels per object (n,) among those counted; voxels without an owner do not count."""
-    return np.bincount(owner[is_counted & (owner >= 0)], minlength=n).astype(np.float64)
+def _count(owner: IntArray, is_counted: BoolArray, n: int, odds: FloatArray | None = None) -> FloatArray:
+    """Voxels per object (n,) among those counted, each by its odds; voxels without an owner do not count."""
+    is_in = is_counted & (owner >= 0)
+    return np.bincount(owner[is_in], weights=None if odds is None else odds[is_in], minlength=n).astype(np.float64)
 
 
 def _either(cells: Cells) -> tuple[Int64Array, IntArray]:
@@ -472,12 +533,31 @@ def _summit(owner: IntArray, top: FloatArray, n: int) -> FloatArray:
     return Groups(owner[is_known], n).quantile(top[is_known], 0.95)
 
 
-def _column_rise(columns: _Columns, n: int) -> FloatArray:
-    """Median change of the columns' tops (n,) m over the columns that both epochs have."""
-    rise = columns.top.after - columns.top.before
-    is_both = np.isfinite(rise)
-    groups = Groups(columns.owner[is_both], n)
-    return np.where(groups.counts >= _LEAST_COLUMNS, groups.median(rise[is_both]), np.nan)
+def _column_rise(voxels: Voxels, surfaces: Pair[Surface], n: int) -> FloatArray:
+    """Median change of the columns' tops (n,) m over the columns that both epochs have.
+
+    The more points, the higher the highest of them: where an epoch has m points of the object in a column and the other
+    k < m, its top is that of k points drawn from the m, which lies at rank (m + 1) / (k + 1) in the mean.
+    """
+    owner = voxels.of_points([side.owner for side in surfaces])
+    kept = np.flatnonzero((owner >= 0) & voxels.is_open)
+    slot = np.repeat(np.arange(2 * len(voxels)), np.diff(voxels.starts))[kept]
+    column = np.repeat(np.arange(len(voxels.columns) - 1), np.diff(voxels.columns))[slot >> 1]
+    z = voxels.of_points([side.xyz[:, 2] for side in surfaces])[kept]
+    key = (column * n + owner[kept]) * 2 + (slot & 1)
+    order = np.lexsort((-z, key))
+    key, z = key[order], z[order]
+    first = np.flatnonzero(np.diff(key, prepend=-1))
+    count = np.diff(first, append=len(key))
+    before = np.flatnonzero((key[first[:-1]] % 2 == 0) & (key[first[1:]] == key[first[:-1]] + 1))
+    tops = []
+    for own, other in ((before, before + 1), (before + 1, before)):
+        rank = np.maximum((count[own] + 1) / (np.minimum(count[own], count[other]) + 1), 1.0) - 1.0
+        low = np.minimum(rank.astype(np.int64), count[own] - 1)
+        high = np.minimum(low + 1, count[own] - 1)
+        tops.append(z[first[own] + low] + (rank - low) * (z[first[own] + high] - z[first[own] + low]))
+    groups = Groups(((key[first[before]] // 2) % max(n, 1)).astype(np.int32), n)
+    return np.where(groups.counts >= _LEAST_COLUMNS, groups.median(tops[1] - tops[0]), np.nan)
 
 
 _LEAST_COLUMNS = 8

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from loda_pdal.kernels.clusters import linked
 from loda_pdal.kernels.neighbours import mean_distances
 from loda_pdal.model.cloud import BoolArray, FloatArray, VoxelCloud
 from loda_pdal.params import OutlierParams
@@ -27,6 +28,9 @@ def remove_outliers(cloud: VoxelCloud, params: OutlierParams) -> VoxelCloud:
 def find_outliers(xyz: FloatArray, params: OutlierParams) -> BoolArray:
     """Points whose mean distance to their k nearest neighbours exceeds mean + multiplier * standard deviation.
 
+    The neighbours of a thin pole lie along one line, and a wall far from the scanner is sampled thinly: with
+    ``keep_voxels``, what hangs together stays.
+
     Parameters
     ----------
     xyz : (m, 3) float64, m
@@ -41,7 +45,12 @@ def find_outliers(xyz: FloatArray, params: OutlierParams) -> BoolArray:
     if len(distance) < 2:
         return np.zeros(len(distance), dtype=np.bool_)
     ascending = np.sort(distance)
-    return np.asarray(distance > ascending.mean() + params.std_multiplier * ascending.std(ddof=1))
+    is_outlier = np.asarray(distance > ascending.mean() + params.std_multiplier * ascending.std(ddof=1))
+    if params.keep_voxels > 0:
+        lonely = np.flatnonzero(is_outlier)
+        cluster = linked(xyz[lonely], params.keep_gap_m)
+        is_outlier[lonely] = np.bincount(cluster, minlength=len(lonely))[cluster] < params.keep_voxels
+    return is_outlier
 
 
 def mean_neighbour_distance(xyz: FloatArray, k: int) -> FloatArray:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,12 @@ _LINK_VOXELS = 2.9
 _MOST_OF = 0.5
 """A region that takes more than this share of an object's columns is no part of it: the object itself changed."""
 
+_WIDE = 0.6
+"""Storeys wider than this many frontages are those of a house of their own."""
+
+_MOST_OF_ROW = 0.75
+"""The same for a row of houses: two of three may have a new storey."""
+
 
 @dataclass(frozen=True)
 class Parts:
@@ -37,62 +44,82 @@ class Parts:
         Object of each point, -1 none; parts are numbered from the old number of objects on.
     parent : (n,) int32
         Object that each object is a part of, -1 none.
+    is_house : (n,) bool
+        Houses that are the unit of change: what is built onto them changes them.
+    is_extension : (n,) bool
+        Parts that are built onto a house; a storey that is as wide as a house is a change of that house alone.
     """
 
     owner: Pair[IntArray]
     parent: IntArray
+    is_house: BoolArray
+    is_extension: BoolArray
 
 
-class _Region(NamedTuple):
+class Region(NamedTuple):
+    """Connected voxels of one object: their columns (k, 2), the voxels (m,), and the share of the columns in which the
+    other epoch has nothing of the object."""
+
     parent: int
     columns: Int64Array
-    n_voxels: int
+    voxels: Int64Array
+    share_new: float
+
+    @property
+    def n_voxels(self) -> int:
+        return len(self.voxels)
 
 
 def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, params: ChangeParams) -> Parts:
-    """Take what changed out of long objects, and what did not out of objects that only one epoch has.
+    """Take what changed out of long objects and houses, and what did not out of objects that only one epoch has.
 
     A terrace is one object, but one of its houses may have a new storey: a connected region of gained, or of lost,
     voxels becomes a part, with all that stands in the columns under its outline. And where a new house was built
     against a shed, the two are one new object: the region that the other epoch shows too becomes a part.
 
-    Objects shorter than ``part_of_length_m`` that both epochs have stay whole, unless they are bodies beside other
-    bodies: where one house of a row ends is not certain. So does an object of which a region takes most columns.
+    Other objects shorter than ``part_of_length_m`` that both epochs have stay whole, and so does an object of which a
+    region takes most columns, unless that is a new house.
+
+    A building up to that length is one house. What changed of a longer one is part of a
+    house in a row: ``frontage_m`` of the row about it are taken out too, as the house that it is a part of. Bodies
+    beside other bodies are looked through whatever their length: where one house of a row ends is not certain.
 
     Plants grow together: where a piece of a plant, ``plant_width_m`` wide, stands on what the other survey saw bare, it
     is a plant of its own, and not a growth of its neighbour.
     """
     n = len(object_class)
     owner = surfaces.map(lambda surface: surface.owner)
-    nobody = np.full(n, -1, dtype=np.int32)
+    nobody, nothing = np.full(n, -1, dtype=np.int32), np.zeros(n, np.bool_)
     if n == 0 or len(cells.voxels) == 0:
-        return Parts(owner, nobody)
+        return Parts(owner, nobody, nothing, nothing)
     is_present = owner.map(lambda side: np.isin(np.arange(n), side))
     is_pair = is_present.before & is_present.after
     xyz = np.concatenate([surface.xyz for surface in surfaces])
-    size = upright_boxes(xyz, np.concatenate(list(owner)), n).size
-    is_whole = np.fmax(size[:, 0], size[:, 1]) <= params.part_of_length_m
+    box = upright_boxes(xyz, np.concatenate(list(owner)), n).size
+    is_long = np.fmax(box[:, 0], box[:, 1]) > params.part_of_length_m
     columns_of = _columns_of(cells, n)
+    has_houses = (object_class == ObjectClass.BUILDING) & (params.frontage_m > 0)
+    is_split = is_long | has_houses
     if params.fills_buildings:
-        is_whole &= ~_are_in_rows(columns_of[0], n)
-    is_long = is_pair & ~is_whole
-    own = cells.owner
+        is_split |= _are_in_rows(columns_of[0], n)
     is_plant = is_pair & (object_class == ObjectClass.VEGETATION) & (params.plant_width_m > 0)
-    bare = cells.bare_columns
-    whole_plant = replace(params, part_min_width_m=params.plant_width_m, part_min_voxels=1)
-    is_long &= ~is_plant
+    is_split &= is_pair & ~is_plant
+    own, bare = cells.owner, cells.bare_columns
+    size = params.part_min_voxels, params.part_min_width_m / params.voxel_m
+    plant = 1, params.plant_width_m / params.voxel_m
     regions = [
-        *_regions(cells, own.before, bare.after, is_plant, whole_plant),
-        *_regions(cells, own.after, bare.before, is_plant, whole_plant),
-        *_regions(cells, own.before, cells.is_lost, is_long, params),
-        *_regions(cells, own.after, cells.is_gained, is_long, params),
-        *_regions(cells, own.before, cells.is_near.after, ~is_pair, params),
-        *_regions(cells, own.after, cells.is_near.before, ~is_pair, params),
+        *connected_regions(cells, own, cells.is_lost, is_split, *size),
+        *connected_regions(cells, own.swapped, cells.is_gained, is_split, *size),
+        *connected_regions(cells, own, bare.after, is_plant, *plant),
+        *connected_regions(cells, own.swapped, bare.before, is_plant, *plant),
+        *connected_regions(cells, own, cells.is_near.after, ~is_pair, *size),
+        *connected_regions(cells, own.swapped, cells.is_near.before, ~is_pair, *size),
     ]
-    most_of = np.where(is_plant, 1.0, _MOST_OF)
-    columns, part, parent = _claim(regions, columns_of, most_of, fills_hull=not params.fills_buildings)
+    columns, part, parent, is_house, is_extension = _claim(
+        regions, columns_of, has_houses & is_pair, is_long, is_plant, params
+    )
     if len(parent) == 0:
-        return Parts(owner, nobody)
+        return Parts(owner, nobody, nothing, nothing)
     lattice = Lattice.around(columns)
     keys = lattice.keys(columns)
     order = np.argsort(keys)
@@ -103,7 +130,10 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, 
         found = lattice.find(keys, row)
         return np.where(found >= 0, n + part[np.maximum(found, 0)], surface.owner).astype(np.int32)
 
-    return Parts(surfaces.map(taken), np.concatenate([nobody, parent]))
+    is_house = np.concatenate([has_houses & is_pair & ~is_long, is_house])
+    is_extension = np.concatenate([nothing, is_extension])
+    parent = np.where(parent < 0, n - 1 - parent, parent)  # a part of another part
+    return Parts(surfaces.map(taken), np.concatenate([nobody, parent]).astype(np.int32), is_house, is_extension)
 
 
 def largest_regions(cells: Cells, n: int, params: ChangeParams) -> Pair[FloatArray]:
@@ -111,16 +141,15 @@ def largest_regions(cells: Cells, n: int, params: ChangeParams) -> Pair[FloatArr
     are not filled, and surfaces have no inside."""
     if not params.fills_buildings:
         return Pair(np.zeros(n), np.zeros(n))
-    everyone = np.ones(n, np.bool_)
-    sides = Pair((cells.owner.before, cells.is_lost), (cells.owner.after, cells.is_gained))
+    everyone, width = np.ones(n, np.bool_), params.part_min_width_m / params.voxel_m
 
-    def largest(side: tuple[IntArray, BoolArray]) -> FloatArray:
+    def largest(owner: Pair[IntArray], is_in: BoolArray) -> FloatArray:
         volume = np.zeros(n)
-        for region in _regions(cells, *side, everyone, params):
+        for region in connected_regions(cells, owner, is_in, everyone, params.part_min_voxels, width):
             volume[region.parent] = max(volume[region.parent], region.n_voxels * params.voxel_m**3)
         return volume
 
-    return sides.map(largest)
+    return Pair(largest(cells.owner, cells.is_lost), largest(cells.owner.swapped, cells.is_gained))
 
 
 def dissolve(owner: Pair[IntArray], is_dissolved: BoolArray, n: int) -> tuple[Pair[IntArray], IntArray]:
@@ -163,25 +192,41 @@ _ROW_CONTACTS = 8
 """Contacts between columns that make two bodies neighbours: more than a corner."""
 
 
-def _regions(
-    cells: Cells, owner: IntArray, is_in: BoolArray, is_split: BoolArray, params: ChangeParams
-) -> list[_Region]:
-    """Connected regions of the marked voxels within one object."""
-    members = np.flatnonzero(is_in & (owner >= 0) & is_split[np.maximum(owner, 0)])
+def connected_regions(
+    cells: Cells, owner: Pair[IntArray], is_in: BoolArray, is_split: BoolArray, least: int, width: float = 0.0
+) -> list[Region]:
+    """Connected regions of at least ``least`` of the marked voxels (c,) within one of the objects ``is_split`` (n,), at
+    least ``width`` voxels wide in plan.
+
+    ``owner`` (c,) of this epoch and of the other.
+    """
+    members = np.flatnonzero(is_in & (owner.before >= 0) & is_split[np.maximum(owner.before, 0)])
     if len(members) == 0:
         return []
     # one tree for all objects: a fourth coordinate keeps them apart
-    place = np.column_stack([cells.voxels.cell[members], owner[members].astype(np.int64) * 10])
+    own = owner.before[members]
+    place = np.column_stack([cells.voxels.cell[members], own.astype(np.int64) * 10])
     links = cKDTree(place).query_pairs(_LINK_VOXELS, output_type="ndarray")
     region = components(links, len(members))
     groups = Groups(region, int(region.max()) + 1)
+    is_shared = _in_column_of(cells, own, members, owner.after)
     found = []
-    for index in np.flatnonzero(groups.counts >= params.part_min_voxels).tolist():
-        inside = members[groups.members(index)]
-        plan = unique_rows(cells.voxels.cell[inside, :2])
-        if params.part_min_width_m == 0 or width_of(plan) * params.voxel_m >= params.part_min_width_m:
-            found.append(_Region(int(owner[inside[0]]), plan, len(inside)))
+    for index in np.flatnonzero(groups.counts >= least).tolist():
+        inside = groups.members(index)
+        plan, first = np.unique(cells.voxels.cell[members[inside], :2], axis=0, return_index=True)
+        if width > 0 and width_of(plan) < width:
+            continue
+        share_new = 1.0 - float(is_shared[inside[first]].mean())
+        found.append(Region(int(own[inside[0]]), plan, members[inside], share_new))
     return found
+
+
+def _in_column_of(cells: Cells, owner: IntArray, voxel: Int64Array, other: IntArray) -> BoolArray:
+    """Whether each ``owner`` (k,) has a voxel among the ``other`` (c,) owners in the column of its ``voxel`` (k,)."""
+    column = np.repeat(np.arange(len(cells.voxels.columns) - 1), np.diff(cells.voxels.columns))
+    n = int(max(owner.max(initial=-1), other.max(initial=-1))) + 1
+    is_held = other >= 0
+    return np.isin(column[voxel] * n + owner, np.unique(column[is_held] * n + other[is_held]))
 
 
 def width_of(columns: Int64Array) -> float:
@@ -202,20 +247,70 @@ def _under(region: Int64Array, columns: Int64Array, *, fills_hull: bool) -> Bool
 
 
 def _claim(
-    regions: list[_Region], columns_of: tuple[Int64Array, Int64Array], most_of: FloatArray, *, fills_hull: bool
-) -> tuple[Int64Array, Int64Array, IntArray]:
-    """Columns (k, 3) that parts take, the part of each, and the parent of each part; the largest region comes first."""
+    regions: list[Region],
+    columns_of: tuple[Int64Array, Int64Array],
+    has_houses: BoolArray,
+    is_long: BoolArray,
+    is_plant: BoolArray,
+    params: ChangeParams,
+) -> tuple[Int64Array, Int64Array, IntArray, BoolArray, BoolArray]:
+    """Columns (k, 3) that parts take, the part of each, and for each part its parent, whether it is a house, and whether
+    it is built onto one.
+
+    The largest region comes first. The parent of a part in a house that is a part itself, number p, is ``-1 - p``.
+    """
     rows, start = columns_of
     part_of = np.full(len(rows), -1, dtype=np.int64)
     parents: list[int] = []
+    is_extension: list[bool] = []
+    in_rows: list[tuple[int, Region]] = []
     for region in sorted(regions, key=lambda r: (-r.n_voxels, r.parent, r.columns[0].tolist())):
         first, last = start[region.parent], start[region.parent + 1]
-        is_inside = _under(region.columns, rows[first:last, 1:], fills_hull=fills_hull)
-        if np.count_nonzero(is_inside) > most_of[region.parent] * (last - first):
+        is_inside = _under(region.columns, rows[first:last, 1:], fills_hull=not params.fills_buildings)
+        is_in_row = has_houses[region.parent] and is_long[region.parent]
+        is_new = has_houses[region.parent] and region.share_new > 0.5
+        is_new = is_new and region.n_voxels * params.voxel_m**3 > params.part_is_new_m3
+        most_of = 1.0 if is_new or is_plant[region.parent] else _MOST_OF_ROW if is_in_row else _MOST_OF
+        if np.count_nonzero(is_inside) > most_of * (last - first):
             continue
         is_free = is_inside & (part_of[first:last] < 0)
         if is_free.any():
+            width_m = float((np.ptp(region.columns, axis=0) + 1).max()) * params.voxel_m
+            is_storey = region.share_new < 0.5 and width_m > _WIDE * params.frontage_m
+            is_extension.append(bool(has_houses[region.parent]) and not is_new and not is_storey)
+            if is_in_row and is_extension[-1]:
+                in_rows.append((len(parents), region))
             part_of[first:last][is_free] = len(parents)
             parents.append(region.parent)
+    is_house = [False] * len(parents)
+    for part, region in in_rows:
+        first, last = start[region.parent], start[region.parent + 1]
+        is_free = _house_about(region.columns, rows[first:last, 1:], params) & (part_of[first:last] < 0)
+        if is_free.any():
+            parents[part] = -1 - len(parents)
+            part_of[first:last][is_free] = len(parents)
+            parents.append(region.parent)
+            is_house.append(True)
+            is_extension.append(False)
     is_claimed = part_of >= 0
-    return rows[is_claimed], part_of[is_claimed], np.array(parents, dtype=np.int32)
+    return (
+        rows[is_claimed],
+        part_of[is_claimed],
+        np.array(parents, dtype=np.int32),
+        np.array(is_house, dtype=np.bool_),
+        np.array(is_extension, dtype=np.bool_),
+    )
+
+
+def _house_about(region: Int64Array, columns: Int64Array, params: ChangeParams) -> BoolArray:
+    """Which columns (k, 2) of a row of houses are the house that has the region: one frontage of the row, all through."""
+    near, reach = params.frontage_m / params.voxel_m, params.part_of_length_m / params.voxel_m
+    middle = (region.min(axis=0) + region.max(axis=0)) / 2
+    offset = columns - middle
+    x, y = offset[np.hypot(offset[:, 0], offset[:, 1]) <= near].T
+    if len(x) == 0:
+        return np.zeros(len(columns), np.bool_)
+    angle = 0.5 * math.atan2(2 * float(np.mean(x * y) - x.mean() * y.mean()), float(np.var(x) - np.var(y)))
+    along, across = np.array([math.cos(angle), math.sin(angle)]), np.array([-math.sin(angle), math.cos(angle)])
+    half = max(near / 2, float(np.abs((region - middle) @ along).max()))
+    return np.asarray((np.abs(offset @ along) <= half) & (np.abs(offset @ across) <= reach))

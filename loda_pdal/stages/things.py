@@ -1,0 +1,99 @@
+"""Things that came or went right beside others: one object with them in one epoch, or in both (METHOD 2b).
+
+A bin beside a vehicle, a sign in a hedge, one more vehicle in a row of them: what stands on the ground, in columns of its
+own, where the other survey shows the ground and nothing of the object, is no growth of its neighbour.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from loda_pdal.model.cloud import BoolArray, FloatArray, IntArray
+from loda_pdal.model.grid import Lattice, cells_of
+from loda_pdal.model.pair import Pair
+from loda_pdal.params import ChangeParams
+from loda_pdal.stages.cues import Cells, Surface, Voxels
+from loda_pdal.stages.parts import Region, connected_regions
+
+_LEAST_NEW = 0.7
+"""Share of a thing's columns that are its own."""
+
+_FOOT_M = 0.8
+"""A thing's lowest point lies no higher above the ground."""
+
+
+def split_things(
+    cells: Cells, surfaces: Pair[Surface], is_asked: BoolArray, params: ChangeParams
+) -> tuple[Pair[IntArray], IntArray]:
+    """Things taken out of the objects that they are merged with.
+
+    Parameters
+    ----------
+    cells : Cells
+        Voxels with their owners.
+    surfaces : Pair of Surface
+        Points with their objects, 0 to ``n - 1``.
+    is_asked : (n,) bool
+        Objects that are looked through.
+
+    Returns
+    -------
+    owner : Pair of (m,) int32
+        Object of each point; things are numbered from ``n`` on.
+    host : (t,) int32
+        The object that each thing was part of.
+    """
+    n = len(is_asked)
+    owner = surfaces.map(lambda surface: surface.owner)
+    if not is_asked.any() or len(cells.voxels) == 0:
+        return owner, np.zeros(0, dtype=np.int32)
+    height = _lowest(cells.voxels, surfaces)
+    came = cells.is_gained & cells.voxels.is_over.before
+    went = cells.is_lost & cells.voxels.is_over.after
+    things = Pair(
+        _things(cells, cells.owner, went, height.before, is_asked, params),
+        _things(cells, cells.owner.swapped, came, height.after, is_asked, params),
+    )
+    n_went = len(things.before)
+    owner = Pair(
+        _given(surfaces.before, things.before, n, params.voxel_m),
+        _given(surfaces.after, things.after, n + n_went, params.voxel_m),
+    )
+    return owner, np.array([thing.parent for side in things for thing in side], dtype=np.int32)
+
+
+def _things(
+    cells: Cells, owner: Pair[IntArray], is_in: BoolArray, height: FloatArray, is_asked: BoolArray, params: ChangeParams
+) -> list[Region]:
+    """Things of one epoch; ``owner`` of this epoch and of the other, ``height`` (c,) m of the lowest point."""
+    found = connected_regions(cells, owner, is_in, is_asked, params.thing_voxels)
+    return [
+        region
+        for region in found
+        if region.share_new >= _LEAST_NEW and float(np.fmin.reduce(height[region.voxels])) <= _FOOT_M
+    ]
+
+
+def _lowest(voxels: Voxels, surfaces: Pair[Surface]) -> Pair[FloatArray]:
+    """Height above ground (c,) m of the lowest point of each epoch in each voxel; NaN where there is none."""
+    height = voxels.of_points([side.height for side in surfaces])
+    lowest = np.full(2 * len(voxels), np.nan)
+    is_filled = np.diff(voxels.starts) > 0
+    if len(height):
+        lowest[is_filled] = np.fmin.reduceat(height, voxels.starts[:-1][is_filled])
+    return Pair(lowest[0::2], lowest[1::2])
+
+
+def _given(surface: Surface, things: list[Region], first: int, voxel_m: float) -> IntArray:
+    """Objects (m,) of the points, those in the columns of a thing given to it."""
+    if not things:
+        return surface.owner
+    rows = np.concatenate([np.column_stack([np.full(len(t.columns), t.parent), t.columns]) for t in things])
+    number = np.repeat(np.arange(first, first + len(things)), [len(t.columns) for t in things])
+    lattice = Lattice.around(rows)
+    keys = lattice.keys(rows)
+    order = np.argsort(keys, kind="stable")
+    is_first = np.diff(keys[order], prepend=-1) != 0  # where two things share a column, the first has it
+    keys, number = keys[order][is_first], number[order][is_first]
+    found = lattice.find(keys, np.column_stack([surface.owner.astype(np.int64), cells_of(surface.xyz[:, :2], voxel_m)]))
+    return np.where(found >= 0, number[np.maximum(found, 0)], surface.owner).astype(np.int32)

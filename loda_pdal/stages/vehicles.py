@@ -1,0 +1,176 @@
+"""Is it the same vehicle: shapes compared after a small move (beyond the paper, which asks for overlap alone).
+
+Another vehicle in the same slot overlaps with the one that left, and may be as high; the same one may have been parked
+again, half a metre on. So each is moved and turned until it fits, and what then still lies apart is another shape.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from loda_pdal.kernels.neighbours import knn, nearest
+from loda_pdal.model.boxes import upright_boxes
+from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array
+from loda_pdal.model.groups import Groups, count_cells
+from loda_pdal.model.pair import Pair
+from loda_pdal.stages.cues import Surface
+
+_ITERATIONS = 10
+_REACH_M = 0.6
+"""Surfaces farther apart do not pull at each other while a vehicle is moved."""
+
+_SOFT_M = 0.05
+"""Residual at which a pair of points pulls half as much as a perfect one."""
+
+_MOST = np.array([0.8, 0.8, 0.1, 0.1])
+"""A vehicle is moved no farther along x, y and z (m), and turned no more about its middle (rad)."""
+
+_NEAR_M = 0.35
+"""Surfaces this close are the same surface: seen by both."""
+
+_FAR_M = 1.0
+"""Residual of points with nothing closer."""
+
+_LEAST_M = (1.2, 2.2, 1.1)
+"""Width, length and height of what can be a vehicle."""
+
+_LEAST_FILL = 0.6
+_CELL_M = 0.5
+_NEIGHBOURS = 4
+_MIN_POINTS = 30
+_APART_M = 100.0
+"""Vehicles are lifted so far from each other that none sees another: one search serves them all."""
+
+
+def shape_change(surfaces: Pair[Surface], is_open: Pair[BoolArray], is_asked: BoolArray) -> FloatArray:
+    """How far the shapes of objects differ between the epochs, (n,) m; NaN where not asked for or too few points.
+
+    The upper quartile of the point-to-plane residuals of one epoch's points on the other's surface after the best move,
+    from the epoch that fits better: what only one epoch shows of a vehicle does not count against it.
+
+    Parameters
+    ----------
+    surfaces : Pair of Surface
+        Points with their objects.
+    is_open : Pair of (m,) bool
+        Whether the other epoch could see where the point is.
+    is_asked : (n,) bool
+        Objects that are compared, present in both epochs.
+    """
+    if not is_asked.any():
+        return np.full(len(is_asked), np.nan)
+    lift = np.where(is_asked, np.cumsum(is_asked), -1)
+    members = surfaces.map(lambda side: np.flatnonzero(np.append(is_asked, False)[side.owner]))
+    apart = surfaces.join(members, lambda side, idx: _lifted(side, idx, lift))
+    before = _residual(
+        surfaces.before,
+        members.before,
+        apart.before,
+        is_open.before,
+        surfaces.after,
+        members.after,
+        apart.after,
+        len(is_asked),
+    )
+    after = _residual(
+        surfaces.after,
+        members.after,
+        apart.after,
+        is_open.after,
+        surfaces.before,
+        members.before,
+        apart.before,
+        len(is_asked),
+    )
+    return np.fmin(before, after)
+
+
+def roughness(surfaces: Pair[Surface], is_asked: BoolArray) -> FloatArray:
+    """Upper quartile (n,) m of the distances of an object's points from the planes of their neighbours, in the rougher
+    epoch; NaN where not asked for: foliage lies that far from itself, and so do noisy surveys."""
+    n = len(is_asked)
+    rough = [np.full(n, np.nan)]
+    for side in surfaces:
+        members = np.flatnonzero(np.append(is_asked, False)[side.owner])
+        if len(members) < 2:
+            continue
+        xyz, normals = side.xyz[members], side.normals[members].astype(np.float64)
+        neighbour = knn(xyz, _NEIGHBOURS, _REACH_M).idx
+        offset = xyz[neighbour] - xyz[:, None, :]
+        across = np.abs(np.einsum("ijk,ijk->ij", normals[neighbour], offset))
+        label = np.where(neighbour >= 0, side.owner[members][:, None], -1)
+        rough.append(Groups(label.ravel(), n).quantile(across.ravel(), 0.75))
+    return np.asarray(np.fmax.reduce(rough))
+
+
+def looks_like_vehicle(surfaces: Pair[Surface], n: int) -> BoolArray:
+    """Which objects (n,) have the size of a vehicle in both epochs and fill their box: no wall, hedge or bin, and no two
+    of them in one piece."""
+    fits = np.ones(n, np.bool_)
+    for side in surfaces:
+        size = upright_boxes(side.xyz, side.owner, n).size
+        width, length = np.sort(size[:, :2], axis=1).T
+        filled = count_cells(side.xyz[:, :2], side.owner, n, _CELL_M) * _CELL_M**2
+        fits &= (width > _LEAST_M[0]) & (length > _LEAST_M[1]) & (size[:, 2] > _LEAST_M[2])
+        fits &= filled > _LEAST_FILL * width * length
+    return fits
+
+
+def _lifted(surface: Surface, members: Int64Array, lift: Int64Array) -> FloatArray:
+    """Points (k, 3) m of the members, each object at a height of its own."""
+    xyz = surface.xyz[members].copy()
+    xyz[:, 2] += _APART_M * lift[surface.owner[members]]
+    return xyz
+
+
+def _residual(
+    surface: Surface,
+    members: Int64Array,
+    xyz: FloatArray,
+    is_open: BoolArray,
+    other: Surface,
+    other_members: Int64Array,
+    other_xyz: FloatArray,
+    n: int,
+) -> FloatArray:
+    """Upper quartile (n,) m of the residuals of one epoch's points (k, 3) on the other's (l, 3)."""
+    owner = surface.owner[members]
+    normals = other.normals[other_members].astype(np.float64)
+    groups = Groups(owner, n)
+    arm = xyz[:, :2] - groups.mean(xyz[:, :2])[owner]
+    arm = np.column_stack([-arm[:, 1], arm[:, 0]])  # where a turn takes the points
+    move = np.zeros((n, 4))
+    for _ in range(_ITERATIONS):
+        move = _moved_on(_at(xyz, arm, move[owner]), arm, other_xyz, normals, groups, move)
+    moved = _at(xyz, arm, move[owner])
+    found, distance = nearest(other_xyz, moved, _FAR_M)
+    normal = normals[found]
+    across = np.abs(np.sum(normal * (other_xyz[found] - moved), axis=1))
+    residual = np.where(np.any(normal != 0, axis=1), across, distance)
+    residual = np.where(found >= 0, residual, _FAR_M)
+    residual[~(is_open[members] | (distance <= _NEAR_M))] = np.nan
+    counted = Groups(np.where(np.isfinite(residual), owner, -1), n)
+    return np.where(counted.counts >= _MIN_POINTS, groups.quantile(residual, 0.75), np.nan)
+
+
+def _at(xyz: FloatArray, arm: FloatArray, move: FloatArray) -> FloatArray:
+    """Points (k, 3) after their moves (k, 4): x, y, z and a small turn."""
+    moved = xyz + move[:, :3]
+    moved[:, :2] += move[:, 3:] * arm
+    return moved
+
+
+def _moved_on(
+    moved: FloatArray, arm: FloatArray, other_xyz: FloatArray, normals: FloatArray, groups: Groups, move: FloatArray
+) -> FloatArray:
+    """The moves (n, 4) after one robust Gauss-Newton step."""
+    found, _ = nearest(other_xyz, moved, _REACH_M)
+    normal = np.where(found[:, None] >= 0, normals[found], 0.0)
+    residual = np.sum(normal * (other_xyz[found] - moved), axis=1)
+    weight = 1.0 / (1.0 + (residual / _SOFT_M) ** 2)
+    slope = np.column_stack([normal, np.sum(normal[:, :2] * arm, axis=1)])
+    pull = groups.sum((weight * residual)[:, None] * slope)
+    stiffness = groups.sum(weight[:, None, None] * slope[:, :, None] * slope[:, None, :])
+    # a side seen alone says nothing about the other directions
+    stiffness += (0.01 * groups.counts + 1e-9)[:, None, None] * np.eye(4)
+    return np.clip(move + np.linalg.solve(stiffness, pull[:, :, None])[:, :, 0], -_MOST, _MOST)
