@@ -18,13 +18,15 @@ if TYPE_CHECKING:
     from loda_pdal.io.outputs import write_outputs
     from loda_pdal.params import Parameters
     from loda_pdal.pipeline import detect_changes
+    from loda_pdal.preset_choice import preset_for
 
 __version__ = "0.1.0"
-__all__ = ["Parameters", "__version__", "detect_changes", "read_epochs", "write_outputs"]
+__all__ = ["Parameters", "__version__", "detect_changes", "preset_for", "read_epochs", "write_outputs"]
 
 _HOMES = {
     "Parameters": "loda_pdal.params",
     "detect_changes": "loda_pdal.pipeline",
+    "preset_for": "loda_pdal.preset_choice",
     "read_epochs": "loda_pdal.io.las",
     "write_outputs": "loda_pdal.io.outputs",
 }

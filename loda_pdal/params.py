@@ -21,6 +21,9 @@ from loda_pdal.model.errors import ParameterError
 
 PRESETS = ("street", "aerial", "paper")
 
+AUTO = "auto"
+"""In place of a preset's name: the one that suits the surveys (`loda_pdal.preset_choice`)."""
+
 
 def param(
     default: Any,

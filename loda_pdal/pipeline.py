@@ -31,6 +31,7 @@ from loda_pdal.model.registration import Registration
 from loda_pdal.model.survey import Survey
 from loda_pdal.model.transform import transform_points
 from loda_pdal.params import ChangeParams, Parameters
+from loda_pdal.preset_choice import doubts_about
 from loda_pdal.stages.association import Descriptors, Matches, associate, describe
 from loda_pdal.stages.changes import Changes, decide_changes
 from loda_pdal.stages.correspondence import Objects, match_instances
@@ -355,7 +356,7 @@ def assemble(
         block=outline_of(in_after),
         parameters=p,
         has_ground=has_ground,
-        warnings=warnings_of(registration, has_ground, changes, ground_change),
+        warnings=[*doubts_about(p.name, surveys), *warnings_of(registration, has_ground, changes, ground_change)],
     )
 
 

@@ -19,13 +19,14 @@ MAY_IMPORT = {
     "stages": {"stages", "kernels", "model", "params"},
     "io": {"io", "kernels", "model", "params"},
     "assembly": {"stages", "model"},
-    "pipeline": {"assembly", "stages", "kernels", "model", "params"},
+    "preset_choice": {"model"},
+    "pipeline": {"assembly", "preset_choice", "stages", "kernels", "model", "params"},
     "warmup": {"pipeline", "kernels", "io", "model", "params"},
-    "pdal_face": {"pdal_face", "pipeline", "assembly", "stages", "kernels", "io", "model", "params"},
+    "pdal_face": {"pdal_face", "pipeline", "preset_choice", "assembly", "stages", "kernels", "io", "model", "params"},
     "benchmark": {"benchmark", "warmup", "pipeline", "stages", "kernels", "io", "model", "params"},
-    "cli": {"cli", "benchmark", "pdal_face", "warmup", "pipeline", "kernels", "io", "model", "params"},
+    "cli": {"cli", "benchmark", "pdal_face", "warmup", "pipeline", "preset_choice", "kernels", "io", "model", "params"},
     "__main__": {"cli"},
-    "__init__": {"pipeline", "io", "model", "params"},
+    "__init__": {"pipeline", "preset_choice", "io", "model", "params"},
 }
 
 
@@ -71,7 +72,7 @@ def test_other_interpreters_can_load_the_parameters(name: str) -> None:
 def test_the_method_knows_no_faces(path: Path) -> None:
     """Only faces know command line, progress bars and files of points; kernels only loop."""
     outside = {full.split(".")[0] for full in imported_names(path)}
-    if part_of(path) in ("model", "params", "kernels", "stages", "assembly", "pipeline"):
+    if part_of(path) in ("model", "params", "kernels", "stages", "assembly", "preset_choice", "pipeline"):
         assert not outside & {"click", "rich", "laspy", "geopandas", "pyogrio", "rasterio", "pdal", "qgis"}
     if part_of(path) == "kernels":
         assert not outside & {"scipy", "shapely", "logging"}

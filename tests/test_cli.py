@@ -100,6 +100,17 @@ def test_usage_errors_exit_with_2(arguments: list[str], capsys: pytest.CaptureFi
     assert said.out == "" and "Error: " in said.err and "Traceback" not in said.err
 
 
+def test_auto_says_which_preset_suits_the_surveys(
+    two_surveys: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["detect", *two_surveys, "-o", str(tmp_path / "out"), "--preset", "auto", "--validate"]
+    assert run(arguments) == 0
+    assert "Preset aerial: the densest quarter of the plan holds 42% and 43% of" in " ".join(
+        capsys.readouterr().err.split()
+    )
+    assert run([*arguments, "--set", "lod.radius=1"]) == 1
+
+
 DETECT = ("detect", "{here}/before.laz", "{here}/after.laz", "-o", "{here}/out")
 MISTAKES: dict[str, tuple[tuple[str, ...], str]] = {
     "missing": (

@@ -185,7 +185,7 @@ def test_what_is_known_of_a_survey_from_its_first_reading(tmp_path: Path, unkept
     assert (survey.n_bytes, survey.sha256) == (path.stat().st_size, hashlib.sha256(path.read_bytes()).hexdigest())
     found, again = survey.extent, Extent.of([survey.xyz])
     assert found.n == again.n == 2000
-    for name in ("low", "high", "cells"):
+    for name in ("low", "high", "cells", "n_in_cell"):
         np.testing.assert_array_equal(getattr(found, name), getattr(again, name))
 
 

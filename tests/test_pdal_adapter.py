@@ -11,6 +11,8 @@ import pytest
 
 from loda_pdal.model import dimensions as dims
 from loda_pdal.model.errors import LodaError, PipelineError
+from loda_pdal.model.pair import Pair
+from loda_pdal.model.survey import Survey
 from loda_pdal.pdal_face import entry
 from loda_pdal.pdal_face.adapter import Call, Points, arguments_of, entry_of, pdal_type
 
@@ -139,6 +141,16 @@ def test_arguments_choose_the_parameters() -> None:
     assert parsed.parameters.name == "aerial"
     assert parsed.parameters.lod.radius_m == 1.5
     assert parsed.run is None
+
+
+def test_auto_takes_the_preset_that_suits_the_points() -> None:
+    from loda_pdal.pdal_face.run import Arguments
+
+    parsed = Arguments.parse({"preset": "auto", "set": {"lod.radius_m": 1.5}})
+    even = Survey(np.random.default_rng(0).uniform(0.0, (60.0, 60.0, 8.0), (9000, 3)))
+    chosen = parsed.for_surveys(Pair(even, even))
+    assert (chosen.name, chosen.lod.radius_m, chosen.fuse.leaf_m) == ("aerial", 1.5, 0.5)
+    assert parsed.parameters.name == "street"
 
 
 def test_an_unknown_entry_is_named() -> None:

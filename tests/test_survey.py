@@ -40,6 +40,9 @@ def test_extent_of_parts_is_that_of_the_whole(seed: int, n: int, size: int) -> N
     of_half = {tuple(cell) for cell in np.floor(half[:, :2] / 10.0).astype(int)}
     assert found.overlap(extent(half)) == len(coarse & of_half) / len(of_half) == 1.0
     assert len(coarse) >= len(of_half)
+    whole = extent(xyz)
+    assert np.array_equal(found.cells, whole.cells) and np.array_equal(found.n_in_cell, whole.n_in_cell)
+    assert found.n_in_cell.sum() == n and 0.25 <= found.dense_share <= 1.0
 
 
 def test_nothing_has_no_extent() -> None:

@@ -19,21 +19,20 @@ import numpy as np
 from loda_pdal.benchmark.evaluate import (
     METHOD_SOURCES,
     N_RESAMPLES,
+    KnownBlock,
     Say,
     described,
     prepared_blocks,
+    read_block,
     read_stamp,
     sources_digest,
 )
 from loda_pdal.benchmark.metrics import LABELS, Scores, markdown_table
 from loda_pdal.benchmark.protocols import ScoreReport, judge
 from loda_pdal.benchmark.reuse import Runs
-from loda_pdal.benchmark.runs import Annotation, judged_result, read_annotation
-from loda_pdal.benchmark.truth import Truth
-from loda_pdal.io.las import read_epochs
+from loda_pdal.benchmark.runs import judged_result
 from loda_pdal.model.cloud import Int64Array
 from loda_pdal.model.errors import LodaError
-from loda_pdal.model.pair import Pair
 from loda_pdal.params import Parameters
 
 Change = Callable[[Parameters], Parameters]
@@ -318,32 +317,29 @@ def _outcomes(block_dir: Path, chosen: list[Parameters], say: Say) -> Iterable[O
     known = read_stamp(path) or {}
     if known.get("version") != version:
         known = {"version": version, "outcomes": {}}
-    loaded: tuple[Runs, Pair[Annotation], Truth] | None = None
+    loaded: tuple[Runs, KnownBlock] | None = None
     for parameters in chosen:
         key = hashlib.sha256(json.dumps(parameters.to_dict(), sort_keys=True).encode()).hexdigest()
         if key not in known["outcomes"]:
             if loaded is None:
-                loaded = _loaded(block_dir)
-            runs, annotation, truth = loaded
+                block = read_block(block_dir)
+                loaded = Runs(block.surveys), block
+            runs, block = loaded
             try:
                 result = runs.detect(parameters)
             except LodaError as error:
                 raise type(error)(
                     f"{block_dir.name}, {described(parameters)}: {error.message}", error.remedy, error.code
                 ) from error
-            outcome = Outcome.of(judge(judged_result(result, annotation, truth.T_after_before), truth))
+            outcome = Outcome.of(
+                judge(judged_result(result, block.annotation, block.truth.T_after_before), block.truth)
+            )
             say(f"  {described(parameters)}: mIoU {100 * _miou(outcome.confusion):.1f}")
             known["outcomes"][key] = outcome.to_dict()
             part = path.with_suffix(".part")
             part.write_text(json.dumps(known), encoding="utf-8")
             part.replace(path)
         yield Outcome.from_dict(known["outcomes"][key])
-
-
-def _loaded(block_dir: Path) -> tuple[Runs, Pair[Annotation], Truth]:
-    truth = Truth.read(block_dir / "truth.json")
-    paths = Pair(block_dir / "before.laz", block_dir / "after.laz")
-    return Runs(read_epochs(*paths)), paths.map(lambda path: read_annotation(path, truth)), truth
 
 
 def _miou(confusion: Int64Array) -> float:

@@ -1,29 +1,40 @@
 """Confidence that means what it says: fit the calibration of a preset on simulated training blocks (METHOD 3).
 
 A label is right when most points of its object belong to instances with that label; Increased and Decreased are right
-as well where the surface that changed within the object changed that way (a part of a house, METHOD 2b). The share of
-right labels is fitted as a logistic function of the raw score, for three kinds of labels; validation blocks then tell
-how far it is off.
+as well where the surface that changed within the object changed that way (a part of a house, METHOD 2b). Points of
+excluded instances do not vote, and objects that lie mostly on them are left out. The share of right labels is fitted
+as a logistic function of the raw score, for three kinds of labels; validation blocks then tell how far it is off.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import hashlib
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize
 
-from loda_pdal.benchmark.blocks import split_of_name
-from loda_pdal.benchmark.simulate import SimulatedBlock, SimulationOptions, simulate_block
+from loda_pdal.benchmark.evaluate import (
+    METHOD_SOURCES,
+    Say,
+    described,
+    prepared_blocks,
+    read_block,
+    read_stamp,
+    sources_digest,
+)
+from loda_pdal.benchmark.metrics import markdown_table
+from loda_pdal.benchmark.runs import JudgedPoints, judged_result
+from loda_pdal.benchmark.truth import Truth
 from loda_pdal.model.cloud import BoolArray, FloatArray
-from loda_pdal.model.frame import LocalFrame
+from loda_pdal.model.errors import InputError, LodaError
 from loda_pdal.model.labels import ChangeLabel
-from loda_pdal.model.pair import Pair
-from loda_pdal.model.records import ChangeResult
-from loda_pdal.model.survey import Survey
+from loda_pdal.model.records import ObjectRecord
 from loda_pdal.params import Parameters
 from loda_pdal.pipeline import detect_changes
 
@@ -37,95 +48,227 @@ KINDS = {
 """The parameter of `ConfidenceParams` that calibrates each label."""
 
 MIN_SHARE = 0.5
-"""Share of an object's points that must belong to instances with its label."""
+"""Share of an object's points that must belong to instances with its label; and of its points that must lie on
+instances that count."""
 
 MIN_CHANGED_SHARE = 0.1
 """Share of an object's points that must lie on surface that changed as its label says."""
 
+N_BINS = 10
+"""Bins of equal width that confidences are told apart by."""
+
+N_DRAWS = 200
+"""Draws of what chance alone makes of the calibration error."""
+
 _PRIOR = 1.0
 """Weight of the prior that keeps the slope finite where all labels are right, in objects."""
 
+Lines = dict[str, tuple[float, float]]
+"""Logistic offset and slope by the parameter that holds them."""
+
 
 class Judged(NamedTuple):
-    """One labelled object: the block it is from, its parameter, raw and calibrated score, and whether it is right."""
+    """One labelled object: the parameter that calibrates its label, its raw score, and whether the label is right."""
 
-    seed: int
     kind: str
     raw: float
-    confidence: float
     is_right: bool
+
+
+class Bin(NamedTuple):
+    """Objects with a confidence between two bounds: how many, their mean confidence, and the share that is right."""
+
+    low: float
+    high: float
+    n: int
+    confidence: float
+    share_right: float
+
+
+@dataclass(frozen=True)
+class Reliability:
+    """What confidences are worth on objects whose truth is known.
+
+    Attributes
+    ----------
+    n : int
+        Objects.
+    error : float
+        Expected calibration error: mean gap between confidence and the share that is right, over the bins.
+    chance : float
+        The error that exact confidences would show, on average, with as many objects.
+    bins : list of Bin
+        Those that hold objects.
+    """
+
+    n: int
+    error: float
+    chance: float
+    bins: list[Bin]
+
+    @classmethod
+    def of(cls, confidence: FloatArray, is_right: BoolArray) -> Reliability:
+        """The reliability of ``confidence`` (n,) of labels that are right or not (n,)."""
+        random = np.random.default_rng(1)
+        draws = random.random((N_DRAWS, len(confidence))) < confidence
+        chance = float(np.mean([calibration_error(confidence, draw) for draw in draws])) if len(confidence) else np.nan
+        which = _bin_of(confidence)
+        bins = [
+            Bin(b / N_BINS, (b + 1) / N_BINS, int(inside.sum()), confidence[inside].mean(), is_right[inside].mean())
+            for b in range(N_BINS)
+            if (inside := which == b).any()
+        ]
+        return cls(len(confidence), calibration_error(confidence, is_right), chance, bins)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {"n": self.n, "error": self.error, "chance": self.chance, "bins": [b._asdict() for b in self.bins]}
+
+    def to_markdown(self) -> str:
+        """The bins as a table."""
+        rows = [[f"{b.low:.1f} to {b.high:.1f}", b.n, float(b.confidence), float(b.share_right)] for b in self.bins]
+        return markdown_table(["confidence", "objects", "mean confidence, %", "right, %"], rows)
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Fitted offsets and slopes by parameter, and how they do on blocks they have not seen.
+    """Fitted offsets and slopes, and how they and the present ones do.
 
     Attributes
     ----------
-    values : dict
-        ``(offset, slope)`` of each calibration parameter.
-    n_train, n_validation : int
-        Objects.
-    error_train, error_validation : float
-        Expected calibration error in ten bins of equal width.
+    title : str
+        What was run on what.
+    values, present : dict
+        ``(offset, slope)`` of each calibration parameter, fitted and as the parameters have them.
+    train, validation : list of Judged
+        Objects of the blocks of each split.
     """
 
-    values: dict[str, tuple[float, float]]
-    n_train: int
-    n_validation: int
-    error_train: float
-    error_validation: float
+    title: str
+    values: Lines
+    present: Lines
+    train: list[Judged]
+    validation: list[Judged]
+
+    def reliability(self, split: str, lines: Lines, kind: str | None = None) -> Reliability:
+        """What ``lines`` are worth on the objects of a split, or on those of one kind among them."""
+        judged = [j for j in getattr(self, split) if kind in (None, j.kind)]
+        return Reliability.of(confidences(judged, lines), np.array([j.is_right for j in judged], dtype=np.bool_))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "title": self.title,
+            "values": self.values,
+            "present": self.present,
+            **{
+                split: {
+                    "fitted": self.reliability(split, self.values).to_dict(),
+                    "present": self.reliability(split, self.present).to_dict(),
+                    "by_kind": {kind: self.reliability(split, self.values, kind).to_dict() for kind in self.values},
+                }
+                for split in ("train", "validation")
+            },
+        }
+
+    def to_markdown(self) -> str:
+        """The fitted parameters, the calibration errors, and the reliability on validation blocks."""
+        rows = []
+        for split in ("train", "validation"):
+            for kind in (None, *self.values):
+                fitted, present = (self.reliability(split, lines, kind) for lines in (self.values, self.present))
+                name = "all" if kind is None else kind.removeprefix("calibration_")
+                errors = (f"{error:.3f}" for error in (fitted.error, present.error, fitted.chance))
+                rows.append([split, name, fitted.n, *errors])
+        values = "\n".join(f"    confidence.{name} = [{a}, {b}]" for name, (a, b) in self.values.items())
+        return "\n\n".join(
+            [
+                f"# Calibration on {self.title}",
+                f"Fitted on the training blocks:\n\n{values}",
+                "## Expected calibration error",
+                markdown_table(["split", "labels", "objects", "fitted", "as it is", "by chance"], rows),
+                "## Reliability on validation blocks",
+                self.reliability("validation", self.values).to_markdown(),
+            ]
+        )
 
 
-def judge_blocks(seeds: Iterable[int], parameters: Parameters) -> Iterator[Judged]:
-    """Labelled objects of the training and validation blocks among ``seeds``; test blocks are passed over."""
-    for seed in seeds:
-        if split_of_name(f"seed {seed}") == "test":
-            continue
-        block = simulate_block(seed, SimulationOptions())
-        surveys = surveys_of(block)
-        yield from judged_objects(seed, block, detect_changes(surveys.before, surveys.after, parameters))
+def calibrate(
+    folder: Path,
+    suite: str,
+    parameters: Parameters,
+    *,
+    models: Path | None = None,
+    limit: int | None = None,
+    say: Say = lambda text: None,
+) -> Calibration:
+    """Fit the confidence of ``parameters`` on the training blocks of a suite and check it on its validation blocks.
+
+    What was found on a block is kept in ``FOLDER/NAME/calibration.json``, so that an interrupted fit goes on where it
+    was; arguments as for `run_suite`.
+    """
+    judged: dict[str, list[Judged]] = {"train": [], "validation": []}
+    n_blocks = dict.fromkeys(judged, 0)
+    for split, found in judged.items():
+        for name, block_dir in prepared_blocks(folder, suite, split, models=models, limit=limit, say=say):
+            found += _judged_block(block_dir, parameters, name, say)
+            n_blocks[split] += 1
+    title = (
+        f"suite {suite}: {n_blocks['train']} training and {n_blocks['validation']} validation blocks, "
+        f"{described(parameters)}"
+    )
+    return Calibration(title, fit(judged["train"]), present_lines(parameters), judged["train"], judged["validation"])
 
 
-def surveys_of(block: SimulatedBlock) -> Pair[Survey]:
-    """Both surveys of a simulated block, as a reader would give them."""
-    low = np.floor(block.surveys.after.xyz.min(axis=0) / 1000.0) * 1000
-    frame = LocalFrame((int(low[0]), int(low[1]), 0))
-    return block.surveys.map(lambda survey: Survey(frame.to_local(survey.xyz), frame))
-
-
-def judged_objects(seed: int, block: SimulatedBlock, result: ChangeResult) -> list[Judged]:
-    """Whether each labelled object of a result is right."""
-    n = max((o.object_id for o in result.objects), default=0) + 1
-    of_instance = np.full(max(i.instance_id for i in block.truth.instances) + 1, ChangeLabel.UNCHANGED, dtype=np.uint8)
-    for instance in block.truth.instances:
+def judged_objects(points: JudgedPoints, truth: Truth, objects: Sequence[ObjectRecord]) -> list[Judged]:
+    """Whether the label of each object is right, for those with a confidence that the truth can judge."""
+    n_objects = max((o.object_id for o in objects), default=0) + 1
+    n_ids = int(points.truth_id.max(initial=max(truth.by_id, default=0))) + 1
+    of_instance = np.full(n_ids, ChangeLabel.UNCHANGED, dtype=np.uint8)
+    is_excluded = np.zeros(n_ids, dtype=np.bool_)
+    for instance in truth.instances:
         of_instance[instance.instance_id] = instance.label
-    by_instance, by_surface = np.zeros((n, len(ChangeLabel))), np.zeros((n, len(ChangeLabel)))
-    for survey, points in zip(block.surveys, result.points, strict=True):
-        np.add.at(by_instance, (points.object, of_instance[survey.truth_id]), 1)
-        np.add.at(by_surface, (points.object, survey.truth_change), 1)
+        is_excluded[instance.instance_id] = instance.excluded is not None
+    counts = ~is_excluded[points.truth_id]
+    by_instance = _votes(points.object[counts], of_instance[points.truth_id[counts]], n_objects)
+    by_surface = _votes(points.object[counts], points.truth_change[counts], n_objects)
+    n_points = np.bincount(points.object, minlength=n_objects)
     judged = []
-    for record in result.objects:
-        if record.confidence is None or record.confidence_raw is None:
+    for record in objects:
+        votes, changed = by_instance[record.object_id], by_surface[record.object_id]
+        is_on_excluded = votes.sum() <= MIN_SHARE * n_points[record.object_id]
+        if record.confidence_raw is None or record.label not in KINDS or is_on_excluded:
             continue
-        instance_votes, surface_votes = by_instance[record.object_id], by_surface[record.object_id]
-        is_right = bool(instance_votes[record.label] >= MIN_SHARE * instance_votes.sum())
+        is_right = bool(votes[record.label] >= MIN_SHARE * votes.sum())
         if record.label in (ChangeLabel.INCREASED, ChangeLabel.DECREASED):
-            share = surface_votes[record.label] / max(surface_votes.sum(), 1)
-            is_right |= bool(share >= MIN_CHANGED_SHARE and surface_votes[record.label] == surface_votes[2:].max())
-        judged.append(Judged(seed, KINDS[record.label], record.confidence_raw, record.confidence, is_right))
+            share = changed[record.label] / changed.sum()
+            is_right |= bool(share >= MIN_CHANGED_SHARE and changed[record.label] == changed[ChangeLabel.ADDED :].max())
+        judged.append(Judged(KINDS[record.label], record.confidence_raw, is_right))
     return judged
 
 
-def fit(judged: list[Judged]) -> Calibration:
-    """Logistic calibration from the objects of training blocks, checked on those of validation blocks."""
-    train = [j for j in judged if split_of_name(f"seed {j.seed}") == "train"]
-    unseen = [j for j in judged if split_of_name(f"seed {j.seed}") == "validation"]
-    values = {}
+def fit(judged: Sequence[Judged]) -> Lines:
+    """The logistic curve of each kind of label."""
+    kinds = dict.fromkeys(KINDS.values())
+    return {
+        kind: logistic([j.raw for j in judged if j.kind == kind], [j.is_right for j in judged if j.kind == kind])
+        for kind in kinds
+    }
+
+
+def present_lines(parameters: Parameters) -> Lines:
+    """The curves that parameters have."""
+    lines = {}
     for kind in dict.fromkeys(KINDS.values()):
-        own = [j for j in train if j.kind == kind]
-        values[kind] = logistic([j.raw for j in own], [j.is_right for j in own])
-    return Calibration(values, len(train), len(unseen), _error(train, values), _error(unseen, values))
+        offset, slope = getattr(parameters.confidence, kind)
+        lines[kind] = (offset, slope)
+    return lines
+
+
+def confidences(judged: Sequence[Judged], lines: Lines) -> FloatArray:
+    """Confidence (n,) of each object."""
+    score = [lines[j.kind][0] + lines[j.kind][1] * j.raw for j in judged]
+    return np.asarray(1.0 / (1.0 + np.exp(-np.array(score, dtype=np.float64))))
 
 
 def logistic(raw: list[float], is_right: list[bool]) -> tuple[float, float]:
@@ -141,19 +284,42 @@ def logistic(raw: list[float], is_right: list[bool]) -> tuple[float, float]:
     return round(float(found.x[0]), 2), round(float(found.x[1]), 2)
 
 
-def calibration_error(confidence: npt.NDArray[np.float64], is_right: BoolArray, bins: int = 10) -> float:
+def calibration_error(confidence: FloatArray, is_right: BoolArray) -> float:
     """Expected calibration error: mean gap between confidence and the share that is right, over bins of confidence."""
     if len(confidence) == 0:
         return float("nan")
-    which = np.minimum((confidence * bins).astype(np.int64), bins - 1)
-    gap = 0.0
-    for index in range(bins):
-        inside = which == index
-        if inside.any():
-            gap += inside.mean() * abs(float(confidence[inside].mean()) - float(is_right[inside].mean()))
-    return float(gap)
+    which = _bin_of(confidence)
+    gap = np.bincount(which, confidence, N_BINS) - np.bincount(which, is_right, N_BINS)
+    return float(np.abs(gap).sum() / len(confidence))
 
 
-def _error(judged: list[Judged], values: dict[str, tuple[float, float]]) -> float:
-    confidence = np.array([1 / (1 + np.exp(-(values[j.kind][0] + values[j.kind][1] * j.raw))) for j in judged])
-    return calibration_error(confidence, np.array([j.is_right for j in judged], dtype=np.bool_))
+def _bin_of(confidence: FloatArray) -> npt.NDArray[np.int64]:
+    return np.minimum((confidence * N_BINS).astype(np.int64), N_BINS - 1)
+
+
+def _votes(objects: npt.NDArray[Any], labels: npt.NDArray[Any], n_objects: int) -> npt.NDArray[Any]:
+    """Points of each object by label, (n_objects, 6)."""
+    n_labels = len(ChangeLabel)
+    keys = objects.astype(np.int64) * n_labels + labels
+    return np.asarray(np.bincount(keys, minlength=n_objects * n_labels).reshape(n_objects, n_labels))
+
+
+def _judged_block(block_dir: Path, parameters: Parameters, name: str, say: Say) -> list[Judged]:
+    """The judged objects of a block, from the file beside it where it is of the same method and parameters."""
+    path = block_dir / "calibration.json"
+    about = json.dumps(parameters.to_dict(), sort_keys=True).encode() + (block_dir / "block.json").read_bytes()
+    version = hashlib.sha256(about).hexdigest() + sources_digest(*METHOD_SOURCES)
+    known = read_stamp(path) or {}
+    if known.get("version") != version:
+        say(f"{name}: running")
+        block = read_block(block_dir)
+        try:
+            result = detect_changes(block.surveys.before, block.surveys.after, parameters)
+        except LodaError as error:
+            raise InputError(f"{name}: {error.message}", error.remedy, error.code) from error
+        points = judged_result(result, block.annotation, block.truth.T_after_before)
+        known = {"version": version, "objects": judged_objects(points, block.truth, result.objects)}
+        part = path.with_suffix(".part")
+        part.write_text(json.dumps(known), encoding="utf-8")
+        part.replace(path)
+    return [Judged(*row) for row in known["objects"]]

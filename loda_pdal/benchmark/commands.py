@@ -6,7 +6,7 @@ import json
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import click
 
@@ -17,28 +17,54 @@ if TYPE_CHECKING:
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def _suite_options(command: F) -> F:
-    """Which blocks, and with which parameters: what `run` and `ablate` share."""
-    for option in reversed(
-        (
-            click.option("--suite", type=click.Choice(["vehicle", "airborne"]), required=True, help="Which blocks."),
-            click.option(
-                "--split",
-                type=click.Choice(["train", "validation", "test"]),
-                default="validation",
-                show_default=True,
-                help="Which of them; choices are made on train and validation only.",
-            ),
-            click.option("--models", type=click.Path(path_type=Path, exists=True), help="Folder of city models."),
-            click.option("--limit", type=click.IntRange(1), metavar="N", help="Only the first blocks."),
-            click.option("--preset", help="Parameters; street for vehicle, aerial for airborne, if left out."),
-            click.option(
-                "--set", "settings", metavar="STAGE.KEY=VALUE", multiple=True, help="Set one parameter; repeatable."
-            ),
-        )
-    ):
-        command = option(command)
-    return command
+def _together(*options: Callable[[Any], Any]) -> Callable[[F], F]:
+    """Several options as one decorator."""
+
+    def decorated(command: F) -> F:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return decorated
+
+
+_suite_options = _together(
+    click.option("--suite", type=click.Choice(["vehicle", "airborne"]), required=True, help="Which blocks."),
+    click.option("--models", type=click.Path(path_type=Path, exists=True), help="Folder of city models."),
+    click.option("--limit", type=click.IntRange(1), metavar="N", help="Only the first blocks."),
+    click.option("--preset", help="Parameters; street for vehicle, aerial for airborne, if left out."),
+    click.option("--set", "settings", metavar="STAGE.KEY=VALUE", multiple=True, help="Set one parameter; repeatable."),
+)
+"""Which blocks, and with which parameters: what the commands share that run the method on suites."""
+
+_split = click.option(
+    "--split",
+    type=click.Choice(["train", "validation", "test"]),
+    default="validation",
+    show_default=True,
+    help="Which of them; choices are made on train and validation only.",
+)
+
+_written = _together(
+    click.option("--json", "as_json", is_flag=True, help="Write everything as JSON."),
+    click.option(
+        "--markdown", type=click.Path(path_type=Path, dir_okay=False), help="Write the tables to this file too."
+    ),
+)
+
+
+class _Result(Protocol):
+    def to_dict(self) -> dict[str, Any]: ...
+
+    def to_markdown(self) -> str: ...
+
+
+def _show(found: _Result, as_json: bool, markdown: Path | None) -> None:
+    """Print a result, and write its tables where they were asked for."""
+    tables = found.to_markdown()
+    if markdown is not None:
+        markdown.write_text(tables + "\n", encoding="utf-8")
+    click.echo(json.dumps(found.to_dict()) if as_json else tables)
 
 
 def _chosen(suite: str, preset: str | None, settings: tuple[str, ...]) -> Parameters:
@@ -141,26 +167,21 @@ def simulate(
 @bench.command()
 @click.argument("run_dir", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.argument("truth_json", type=click.Path(path_type=Path, exists=True, dir_okay=False))
-@click.option("--json", "as_json", is_flag=True, help="Write everything as JSON.")
-@click.option("--markdown", type=click.Path(path_type=Path, dir_okay=False), help="Write the tables to this file too.")
+@_written
 def score(run_dir: Path, truth_json: Path, as_json: bool, markdown: Path | None) -> None:
     """Score the run in RUN_DIR against TRUTH_JSON: paper, part and strict protocols."""
     from loda_pdal.benchmark.protocols import score_run
 
-    report = score_run(run_dir, truth_json)
-    tables = report.to_markdown()
-    if markdown is not None:
-        markdown.write_text(tables + "\n", encoding="utf-8")
-    click.echo(json.dumps(report.to_dict()) if as_json else tables)
+    _show(score_run(run_dir, truth_json), as_json, markdown)
 
 
 @bench.command()
 @click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
 @_suite_options
+@_split
 @click.option("--result", default="result", show_default=True, metavar="NAME", help="Folder of the results of a block.")
 @click.option("--trajectories", is_flag=True, help="Tell the method where the sensors were; most users cannot.")
-@click.option("--json", "as_json", is_flag=True, help="Write everything as JSON.")
-@click.option("--markdown", type=click.Path(path_type=Path, dir_okay=False), help="Write the tables to this file too.")
+@_written
 @click.option("--sheet", type=click.Path(path_type=Path), help="Pictures of the largest mistakes, a PNG or a folder.")
 def run(
     folder: Path,
@@ -200,17 +221,14 @@ def run(
     if sheet is not None:
         title = f"{suite}, {split} split: the largest of {tiles.n} mistakes"
         _say(f"pictures: {', '.join(map(str, write_sheets(tiles.largest, title, sheet)))}")
-    tables = found.to_markdown()
-    if markdown is not None:
-        markdown.write_text(tables + "\n", encoding="utf-8")
-    click.echo(json.dumps(found.to_dict()) if as_json else tables)
+    _show(found, as_json, markdown)
 
 
 @bench.command()
 @click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
 @_suite_options
-@click.option("--json", "as_json", is_flag=True, help="Write everything as JSON.")
-@click.option("--markdown", type=click.Path(path_type=Path, dir_okay=False), help="Write the tables to this file too.")
+@_split
+@_written
 def ablate(
     folder: Path,
     suite: str,
@@ -230,11 +248,7 @@ def ablate(
 
     _compile_kernels()
     chosen = _chosen(suite, preset, settings)
-    found = ablation.ablate(folder, suite, split, chosen, models=models, limit=limit, say=_say)
-    tables = found.to_markdown()
-    if markdown is not None:
-        markdown.write_text(tables + "\n", encoding="utf-8")
-    click.echo(json.dumps(found.to_dict()) if as_json else tables)
+    _show(ablation.ablate(folder, suite, split, chosen, models=models, limit=limit, say=_say), as_json, markdown)
 
 
 @bench.command()
@@ -360,46 +374,53 @@ def classes(
 
 
 @bench.command()
-@click.option("--first", type=click.IntRange(0), default=101, show_default=True, help="First seed.")
-@click.option(
-    "--last", type=click.IntRange(0), default=130, show_default=True, help="Last seed; test seeds are skipped."
-)
-@click.option("--preset", default="street", show_default=True, help="Parameters whose confidence is calibrated.")
-def calibrate(first: int, last: int, preset: str) -> None:
-    """Fit the calibration of the confidence on simulated training blocks and check it on validation blocks."""
-    from loda_pdal.benchmark.calibrate import fit, judge_blocks
-    from loda_pdal.params import Parameters
+@click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
+@_suite_options
+@_written
+def calibrate(
+    folder: Path,
+    suite: str,
+    models: Path | None,
+    limit: int | None,
+    preset: str | None,
+    settings: tuple[str, ...],
+    as_json: bool,
+    markdown: Path | None,
+) -> None:
+    """Fit the calibration of the confidence on the training blocks of a suite and check it on its validation blocks.
+
+    Blocks and what was found on them are kept in FOLDER, so that an interrupted fit goes on where it was.
+    """
+    from loda_pdal.benchmark import calibrate as calibration
 
     _compile_kernels()
-    found = fit(list(judge_blocks(range(first, last + 1), Parameters.preset(preset))))
-    for name, (offset, slope) in found.values.items():
-        click.echo(f"confidence.{name} = [{offset}, {slope}]")
-    click.echo(f"training: {found.n_train} objects, expected calibration error {found.error_train:.3f}")
-    click.echo(f"validation: {found.n_validation} objects, expected calibration error {found.error_validation:.3f}")
+    chosen = _chosen(suite, preset, settings)
+    _show(calibration.calibrate(folder, suite, chosen, models=models, limit=limit, say=_say), as_json, markdown)
 
 
 @bench.command()
-@click.argument("seeds", type=click.IntRange(0), nargs=-1, required=True)
-@click.option("--preset", default="street", show_default=True, help="Parameters whose limit of detection is checked.")
-def coverage(seeds: tuple[int, ...], preset: str) -> None:
-    """Share of unchanged simulated surface within LoD95, for the blocks of SEEDS surveyed twice without edits."""
-    from loda_pdal.benchmark.coverage import coverage_of, unchanged_grid
-    from loda_pdal.benchmark.metrics import markdown_table
-    from loda_pdal.params import Parameters
+@click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
+@_suite_options
+@_split
+@_written
+def unchanged(
+    folder: Path,
+    suite: str,
+    split: str,
+    models: Path | None,
+    limit: int | None,
+    preset: str | None,
+    settings: tuple[str, ...],
+    as_json: bool,
+    markdown: Path | None,
+) -> None:
+    """Survey the blocks of a suite twice without edits: the share of the surface within LoD95, and what is called
+    changed all the same."""
+    from loda_pdal.benchmark.unchanged import survey_unchanged
 
     _compile_kernels()
-    rows = []
-    for seed in seeds:
-        found = coverage_of(unchanged_grid(seed, Parameters.preset(preset)))
-        rows.append(
-            [
-                seed,
-                found["all"].n_cells,
-                *(f"{100 * c.share:.1f}" for c in found.values()),
-                f"{found['all'].median_m:.3f}",
-            ]
-        )
-    click.echo(markdown_table(["seed", "cells", "all, %", "level", "upright", "slanted", "median LoD95, m"], rows))
+    chosen = _chosen(suite, preset, settings)
+    _show(survey_unchanged(folder, suite, split, chosen, models=models, limit=limit, say=_say), as_json, markdown)
 
 
 @bench.command()

@@ -19,13 +19,13 @@ from dataclasses import asdict, dataclass
 from functools import cache
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from loda_pdal.benchmark.metrics import Scores, markdown_table
 from loda_pdal.benchmark.protocols import ScoreReport, combined, judge
-from loda_pdal.benchmark.runs import JudgedPoints, read_run
+from loda_pdal.benchmark.runs import Annotation, JudgedPoints, read_annotation, read_run
 from loda_pdal.benchmark.simulate import simulate_block, write_block
 from loda_pdal.benchmark.suites import SIZES, SuiteBlock, pieces, streets
 from loda_pdal.benchmark.truth import Truth
@@ -33,6 +33,7 @@ from loda_pdal.io.las import read_epochs
 from loda_pdal.io.outputs import write_outputs
 from loda_pdal.model.errors import InputError, LodaError
 from loda_pdal.model.pair import Pair
+from loda_pdal.model.survey import Survey
 from loda_pdal.params import Parameters
 from loda_pdal.pipeline import detect_changes
 
@@ -157,9 +158,16 @@ def run_suite(
 
 
 def prepared_blocks(
-    folder: Path, suite: str, split: str, *, models: Path | None = None, limit: int | None = None, say: Say
+    folder: Path,
+    suite: str,
+    split: str,
+    *,
+    models: Path | None = None,
+    limit: int | None = None,
+    say: Say,
+    has_edits: bool = True,
 ) -> Iterator[tuple[str, Path]]:
-    """Name and folder of each block of a suite, simulated where it is not there yet."""
+    """Name and folder of each block of a suite, or of the same without edits, simulated where it is not there yet."""
     n_streets, n_pieces = SIZES[suite][split]
     if limit is not None:
         n_streets, n_pieces = min(n_streets, limit), min(n_pieces, max(limit - n_streets, 0))
@@ -170,11 +178,13 @@ def prepared_blocks(
             "models-missing",
         )
     candidates = pieces(suite, split, models) if n_pieces and models is not None else iter(())
-    for block in streets(suite, split)[:n_streets]:
+    for street in streets(suite, split)[:n_streets]:
+        block = street if has_edits else street.unchanged()
         _ensure_block(folder, block, say)
         yield block.name, folder / block.name
     found = 0
-    for block in islice(candidates, n_pieces * MOST_CANDIDATES):
+    for piece in islice(candidates, n_pieces * MOST_CANDIDATES):
+        block = piece if has_edits else piece.unchanged()
         if _ensure_block(folder, block, say):
             found += 1
             yield block.name, folder / block.name
@@ -184,6 +194,21 @@ def prepared_blocks(
         raise InputError(
             f"{models} has room for {found} of {n_pieces} pieces.", "Give other city models.", "city-model"
         )
+
+
+class KnownBlock(NamedTuple):
+    """A block with all that is known of it."""
+
+    surveys: Pair[Survey]
+    annotation: Pair[Annotation]
+    truth: Truth
+
+
+def read_block(block_dir: Path) -> KnownBlock:
+    """A block that was simulated."""
+    truth = Truth.read(block_dir / "truth.json")
+    paths = Pair(block_dir / "before.laz", block_dir / "after.laz")
+    return KnownBlock(read_epochs(*paths), paths.map(lambda path: read_annotation(path, truth)), truth)
 
 
 def interval(reports: list[ScoreReport], *, by_part: bool = False) -> tuple[float, float]:

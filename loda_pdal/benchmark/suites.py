@@ -12,7 +12,7 @@ follow from its seed.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -63,6 +63,10 @@ class SuiteBlock:
     def is_city(self) -> bool:
         """Whether it is a piece of a city model, which may have no room for it."""
         return bool(self.options.city)
+
+    def unchanged(self) -> SuiteBlock:
+        """The same block, surveyed twice without edits and passing traffic."""
+        return replace(self, name=f"{self.name}_unchanged", options=replace(self.options, has_edits=False))
 
 
 def streets(suite: str, split: str) -> list[SuiteBlock]:

@@ -12,6 +12,7 @@ import click
 from loda_pdal.cli import options, stopping, verbosity
 from loda_pdal.cli.ahead import METHOD, WRITERS, import_ahead
 from loda_pdal.cli.progress import Reporter, reporter_for
+from loda_pdal.params import AUTO, PRESETS
 
 if TYPE_CHECKING:
     from loda_pdal.model.pair import Pair
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 @click.option(
     "-o", "--output", "folder", required=True, type=click.Path(path_type=Path), help="Folder for the results."
 )
-@options.parameters
+@options.parameters(*PRESETS, AUTO)
 @click.option(
     "--trajectory-before",
     metavar="FILE",
@@ -78,17 +79,28 @@ def detect(
     with reporter_for(progress_kind) as reporter:
         if progress_kind == "json":
             stopping.when_parent_dies()
-        parameters = options.chosen_parameters(preset, params_file, settings)
+        is_auto = preset == AUTO
+        parameters = options.chosen_parameters(None if is_auto else preset, params_file, settings)
         from loda_pdal.io.outputs import check_output_folder
         from loda_pdal.model.pair import Pair
 
         check_output_folder(folder, overwrite, (before, after))
         trajectories = Pair(trajectory_before, trajectory_after)
         surveys = _read(reporter, before, after, trajectories, parameters, epsg, assume_same_crs, max_memory)
+        run_info: dict[str, Any] = {"command": ["loda-pdal", *sys.argv[1:]]}
+        if is_auto:
+            from loda_pdal.preset_choice import preset_for
+
+            suits = preset_for(surveys)
+            reporter.info(f"Preset {suits.name}: {suits.reason}.")
+            run_info["preset_reason"] = suits.reason
+            parameters = options.chosen_parameters(suits.name, params_file, settings)
         if validate:
             reporter.info("Everything is in order; nothing was computed.")
             return
-        summary, outputs = _run(reporter, surveys, folder, parameters, threads, keep_frames, cloud_format, overwrite)
+        summary, outputs = _run(
+            reporter, surveys, folder, parameters, threads, keep_frames, cloud_format, overwrite, run_info
+        )
         reporter.result(outputs, summary)
     if progress_kind == "json":
         return
@@ -139,6 +151,7 @@ def _run(
     keep_frames: bool,
     cloud_format: str,
     overwrite: bool,
+    run_info: dict[str, Any],
 ) -> tuple[dict[str, Any], dict[str, Path]]:
     """The run itself: its summary and the files it wrote."""
     from loda_pdal.io.outputs import abandon_outputs, write_outputs
@@ -159,18 +172,13 @@ def _run(
     for warning in summary["warnings"]:
         reporter.warning(warning)
     reporter.progress(len(STEPS), total, "writing the results")
-    run_info = {
-        "command": ["loda-pdal", *sys.argv[1:]],
-        "started": started.isoformat(timespec="seconds"),
-        "preset": parameters.name,
-    }
     outputs = write_outputs(
         result,
         surveys,
         folder,
         overwrite=overwrite,
         keep_frames=keep_frames,
-        run_info=run_info,
+        run_info={**run_info, "started": started.isoformat(timespec="seconds"), "preset": parameters.name},
         cloud_format=cloud_format,
     )
     reporter.progress(total, total, "done")

@@ -13,7 +13,7 @@ import click
 
 from loda_pdal.cli import stopping
 from loda_pdal.cli.progress import KINDS, Reporter
-from loda_pdal.params import PRESETS, Parameters
+from loda_pdal.params import AUTO, Parameters
 
 if TYPE_CHECKING:
     from loda_pdal.warmup import Compiled
@@ -21,9 +21,19 @@ if TYPE_CHECKING:
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def parameters(command: F) -> F:
-    """``--preset``, ``--params`` and ``--set``, handed on as ``preset``, ``params_file`` and ``settings``."""
-    for option in (
+_MADE_FOR = {
+    "street": "vehicle LiDAR (the default)",
+    "aerial": "airborne LiDAR",
+    "paper": "the paper to the letter",
+    AUTO: "street or aerial, whichever the surveys look like",
+}
+
+
+def parameters(*presets: str) -> Callable[[F], F]:
+    """``--preset`` (one of ``presets``), ``--params`` and ``--set``, handed on as ``preset``, ``params_file`` and
+    ``settings``."""
+    made_for = "; ".join(f"{name}: {_MADE_FOR[name]}" for name in presets)
+    chosen = (
         click.option(
             "--set",
             "settings",
@@ -40,12 +50,17 @@ def parameters(command: F) -> F:
         ),
         click.option(
             "--preset",
-            type=click.Choice(PRESETS),
-            help="Where to start from: vehicle LiDAR (street, the default), airborne, or the paper to the letter.",
+            type=click.Choice(presets),
+            help=f"Where to start from. {made_for}.",
         ),
-    ):
-        command = option(command)
-    return command
+    )
+
+    def decorated(command: F) -> F:
+        for option in chosen:
+            command = option(command)
+        return command
+
+    return decorated
 
 
 def chosen_parameters(preset: str | None, params_file: Path | None, settings: Sequence[str]) -> Parameters:

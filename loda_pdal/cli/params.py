@@ -11,11 +11,11 @@ import click
 import loda_pdal
 from loda_pdal.cli import options, verbosity
 from loda_pdal.model.errors import OutputError
-from loda_pdal.params import PRESETS, Parameters
+from loda_pdal.params import AUTO, PRESETS, Parameters
 
 
 @click.command(short_help="Print or write all parameters.")
-@options.parameters
+@options.parameters(*PRESETS)
 @click.option("-o", "--output", type=click.Path(path_type=Path), metavar="FILE", help="Write there; .json gives JSON.")
 @options.overwrite
 @options.as_json
@@ -47,6 +47,7 @@ def _described(chosen: Parameters) -> dict[str, Any]:
         stage["parameters"].append({key: values[key] for key in values if key not in ("stage", "stage_doc")})
     return {
         "version": loda_pdal.__version__,
+        "preset_names": [*PRESETS, AUTO],
         "presets": {name: Parameters.preset(name).to_dict() for name in PRESETS},
         "name": chosen.name,
         "adapts_to_spacing": chosen.adapts_to_spacing,

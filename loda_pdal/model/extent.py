@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -9,8 +10,9 @@ import numpy as np
 
 from loda_pdal.model.cloud import FloatArray, Int64Array
 
-CELL_M = 5.0
-"""Edge of the plan cells in which spacing is measured; overlap is counted in cells of twice that."""
+CELL_M = 2.5
+"""Edge of the plan cells in which points are counted; spacing is measured in cells of twice that, overlap of four times
+that."""
 
 _FURTHEST = 2.0**31 - 1
 
@@ -27,18 +29,21 @@ class Extent:
         Lowest and highest local coordinates; infinite, and the other way round, where there is no point.
     cells : (c,) int64
         Occupied plan cells of `CELL_M` as sorted keys: number along x in the upper half, along y in the lower.
+    n_in_cell : (c,) int64
+        Points in each of them.
     """
 
     n: int
     low: FloatArray
     high: FloatArray
     cells: Int64Array
+    n_in_cell: Int64Array
 
     @classmethod
     def of(cls, parts: Iterable[FloatArray]) -> Extent:
         """Extent of a cloud that comes in parts (k, 3), local m."""
         n, low, high = 0, np.full(3, np.inf), np.full(3, -np.inf)
-        keys = [np.empty(0, dtype=np.int64)]
+        keys, counts = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int64)]
         for xyz in parts:
             if len(xyz) == 0:
                 continue
@@ -46,8 +51,10 @@ class Extent:
             for axis in range(3):
                 low[axis] = min(low[axis], xyz[:, axis].min())
                 high[axis] = max(high[axis], xyz[:, axis].max())
-            keys.append(_distinct(_key(_cell(xyz[:, 0]), _cell(xyz[:, 1]))))
-        return cls(n, low, high, _distinct(np.concatenate(keys)))
+            key, count = _counted(_key(_cell(xyz[:, 0]), _cell(xyz[:, 1])))
+            keys.append(key)
+            counts.append(count)
+        return cls(n, low, high, *_summed(np.concatenate(keys), np.concatenate(counts)))
 
     @property
     def size_m(self) -> FloatArray:
@@ -57,11 +64,19 @@ class Extent:
     @property
     def spacing_m(self) -> float:
         """Mean point spacing (m) in plan: root of the area of occupied cells, with their gaps, per point."""
-        return float(CELL_M * np.sqrt(len(self.cells) / self.n)) if self.n else 0.0
+        return float(2 * CELL_M * np.sqrt(len(_coarser(self.cells)) / self.n)) if self.n else 0.0
+
+    @property
+    def dense_share(self) -> float:
+        """Share of the points in the densest quarter of the occupied cells: 0.25 for an even cloud, 1 at most."""
+        if not self.n:
+            return 0.0
+        sparse_to_dense = np.sort(self.n_in_cell)
+        return float(sparse_to_dense[-math.ceil(len(self.cells) / 4) :].sum() / self.n)
 
     def overlap(self, other: Extent) -> float:
-        """Share of the smaller cloud's occupied plan cells of 2 `CELL_M` that the other occupies too, 0 to 1."""
-        a, b = _coarser(self.cells), _coarser(other.cells)
+        """Share of the smaller cloud's occupied plan cells of 4 `CELL_M` that the other occupies too, 0 to 1."""
+        a, b = (_coarser(_coarser(extent.cells)) for extent in (self, other))
         return len(np.intersect1d(a, b, assume_unique=True)) / max(min(len(a), len(b)), 1)
 
 
@@ -77,11 +92,20 @@ def _key(i: Int64Array, j: Int64Array) -> Int64Array:
 def _coarser(keys: Int64Array) -> Int64Array:
     """Distinct keys of the cells of twice the edge."""
     j = (keys & 0xFFFFFFFF).astype(np.uint32).view(np.int32).astype(np.int64)
-    return _distinct(_key(keys >> 33, j >> 1))
+    return np.unique(_key(keys >> 33, j >> 1))
 
 
-def _distinct(keys: Int64Array) -> Int64Array:
-    """Distinct keys, sorted; neighbours in a survey are mostly in one cell, and need no sorting."""
+def _counted(keys: Int64Array) -> tuple[Int64Array, Int64Array]:
+    """Distinct keys, sorted, and how often each is there; neighbours in a survey are mostly in one cell."""
     is_new = np.ones(len(keys), dtype=np.bool_)
     is_new[1:] = keys[1:] != keys[:-1]
-    return np.unique(keys[is_new])
+    start = np.flatnonzero(is_new)
+    return _summed(keys[start], np.diff(start, append=len(keys)))
+
+
+def _summed(keys: Int64Array, counts: Int64Array) -> tuple[Int64Array, Int64Array]:
+    """Distinct keys, sorted, with the sum of the counts of each."""
+    distinct, which = np.unique(keys, return_inverse=True)
+    total = np.zeros(len(distinct), dtype=np.int64)
+    np.add.at(total, which, counts)
+    return distinct, total

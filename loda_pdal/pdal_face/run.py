@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -40,8 +41,11 @@ from loda_pdal.model.pair import Pair, at_once
 from loda_pdal.model.records import ChangeResult
 from loda_pdal.model.survey import Survey
 from loda_pdal.model.transform import transform_points
-from loda_pdal.params import Parameters
+from loda_pdal.params import AUTO, Parameters
 from loda_pdal.pdal_face.adapter import Call, Points
+from loda_pdal.preset_choice import preset_for
+
+logger = logging.getLogger(__name__)
 
 _NAMES = Pair("the before epoch", "the after epoch")
 
@@ -58,6 +62,8 @@ class Arguments:
         Run folder; None keeps nothing, so that each stage computes all it needs.
     parameters : Parameters
         From ``preset``, ``params`` (a file) and ``set`` (``{"lod.radius_m": 1.5}``).
+    is_auto : bool
+        The preset is the one that suits the surveys, see `for_surveys`.
     epsg : int or None
         CRS of both surveys, whatever their files say.
     assume_same_crs : bool
@@ -66,8 +72,10 @@ class Arguments:
 
     run: Path | None
     parameters: Parameters
+    is_auto: bool
     epsg: int | None
     assume_same_crs: bool
+    given: Mapping[str, Any]
 
     @classmethod
     def parse(cls, given: Mapping[str, Any]) -> Arguments:
@@ -78,21 +86,35 @@ class Arguments:
             raise ParameterError(
                 f"pdalargs: unknown name {unknown[0]!r}.", f"Known are {', '.join(known)}.", "pdalargs-invalid"
             )
-        parameters = Parameters.preset(str(given.get("preset", "street")))
-        if given.get("params"):
-            parameters = Parameters.load(Path(str(given["params"])), None if "preset" not in given else parameters)
-        settings = given.get("set", {})
-        if not isinstance(settings, Mapping):
-            raise ParameterError(
-                "pdalargs: set is no table.", 'Write "set": {"lod.radius_m": 1.5}.', "pdalargs-invalid"
-            )
-        for key, value in settings.items():
-            stage, _, name = str(key).partition(".")
-            parameters = parameters.with_values({stage: {name: value}}, where="pdalargs")
+        is_auto = given.get("preset") == AUTO
+        parameters = _chosen({**given, "preset": "street"} if is_auto else given)
         run, epsg = given.get("run"), given.get("epsg")
         if epsg is not None and (not isinstance(epsg, int) or isinstance(epsg, bool)):
             raise ParameterError(f"pdalargs: epsg is {epsg!r}.", 'Write "epsg": 28992.', "pdalargs-invalid")
-        return cls(Path(str(run)) if run else None, parameters, epsg, bool(given.get("assume_same_crs", False)))
+        folder = Path(str(run)) if run else None
+        return cls(folder, parameters, is_auto, epsg, bool(given.get("assume_same_crs", False)), given)
+
+    def for_surveys(self, surveys: Pair[Survey]) -> Parameters:
+        """The parameters, with the preset that suits the surveys where that was asked for."""
+        if not self.is_auto:
+            return self.parameters
+        suits = preset_for(surveys)
+        logger.info("Preset %s: %s.", suits.name, suits.reason)
+        return _chosen({**self.given, "preset": suits.name})
+
+
+def _chosen(given: Mapping[str, Any]) -> Parameters:
+    """Parameters as ``preset``, ``params`` and ``set`` choose them."""
+    parameters = Parameters.preset(str(given.get("preset", "street")))
+    if given.get("params"):
+        parameters = Parameters.load(Path(str(given["params"])), None if "preset" not in given else parameters)
+    settings = given.get("set", {})
+    if not isinstance(settings, Mapping):
+        raise ParameterError("pdalargs: set is no table.", 'Write "set": {"lod.radius_m": 1.5}.', "pdalargs-invalid")
+    for key, value in settings.items():
+        stage, _, name = str(key).partition(".")
+        parameters = parameters.with_values({stage: {name: value}}, where="pdalargs")
+    return parameters
 
 
 class Run:
@@ -176,6 +198,7 @@ class Run:
             "epsg": self.arguments.epsg,
             "assume_same_crs": self.arguments.assume_same_crs,
             "crs_wkt": self._call.crs_wkt,
+            "is_auto": self.arguments.is_auto,
             "parameters": self.arguments.parameters.to_dict(),
         }
         digest = hashlib.blake2b(json.dumps(about, sort_keys=True).encode(), digest_size=16)
@@ -259,7 +282,7 @@ STEPS: dict[str, Callable[[Run], Any]] = {
 def _resolved(run: Run) -> Parameters:
     """Parameters for these points, once they were found to be two surveys of one place."""
     check_coverage(_NAMES, run.surveys.map(lambda survey: survey.extent))
-    return pipeline.resolve(run.arguments.parameters, run.surveys)
+    return pipeline.resolve(run.arguments.for_surveys(run.surveys), run.surveys)
 
 
 def heights(run: Run) -> Values:

@@ -142,12 +142,12 @@ class LodaAlgorithm(QgsProcessingAlgorithm):
             QgsProcessingParameterEnum(
                 "PRESET",
                 "Preset",
-                list(definitions["presets"]),
+                definitions.get("preset_names", list(definitions["presets"])),
                 defaultValue=definitions["name"],
                 usesStaticStrings=True,
             ),
-            "Where all parameters start from: street (vehicle LiDAR), aerial (airborne LiDAR) or paper (the published "
-            "method to the letter).",
+            "Where all parameters start from: street (vehicle LiDAR), aerial (airborne LiDAR), paper (the published "
+            "method to the letter) or auto (street or aerial, whichever the surveys look like).",
         )
         self._add(
             QgsProcessingParameterFile(
