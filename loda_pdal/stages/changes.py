@@ -101,6 +101,8 @@ def decide_changes(
         is_vehicle = (cast.object_class == ObjectClass.MOBILE) & looks_like_vehicle(cast.surfaces, len(cast))
         is_asked = cast.is_pair & (cast.object_class != ObjectClass.BUILDING) & ~is_vehicle
         owner, host = split_things(cells, cast.surfaces, is_asked, params)
+        is_kept = cast.with_more(owner, host).is_smooth(host)
+        owner = owner.map(lambda side: is_kept[side])
         cast = cast.with_more(owner, host).settled(voxels)
         cells = cast.cells(voxels, params)
     if params.find_parts:
@@ -109,19 +111,23 @@ def decide_changes(
         cells = cast.cells(voxels, params)
     evidence = weigh(cells, cast.surfaces, len(cast), params)
     surfaces, object_class, parent, is_apart = cast.surfaces, cast.object_class, cast.parent, cast.is_apart
+    is_smooth = roughness(cast.surfaces, cast.is_extension) < _FOLIAGE_M
     carrier = np.append(cast.is_house, False)[parent] & cast.is_extension
     cues = _rows(evidence, object_class)
+    is_part = (parent >= 0) & ~cast.is_extension
     verdicts = [
         _verdict(cue, apart, part, params, observability)
-        for cue, apart, part in zip(cues, is_apart.tolist(), (parent >= 0).tolist(), strict=True)
+        for cue, apart, part in zip(cues, is_apart.tolist(), is_part.tolist(), strict=True)
     ]
+    for i in np.flatnonzero(cast.is_extension).tolist():
+        verdicts[i] = _extension(verdicts[i])
     raw = np.array(
         [
             _raw(cue, v, apart, params, confidence)
             for cue, v, apart in zip(cues, verdicts, is_apart.tolist(), strict=True)
         ]
     )
-    for i, part in _changed_houses(verdicts, parent, carrier, evidence.dv).items():
+    for i, part in _changed_houses(verdicts, parent, carrier & is_smooth, evidence.dv).items():
         verdicts[i] = Verdict(verdicts[part].label, f"a part of it changed: {verdicts[part].reason}")
         raw[i] = raw[part]
     sure = [calibrated(score, v.label, confidence) for score, v in zip(raw.tolist(), verdicts, strict=True)]
@@ -168,7 +174,7 @@ class _Cast:
     def without_surroundings(self, is_within: BoolArray, is_shared: Pair[BoolArray]) -> _Cast:
         """Of the marked objects (k,) keep what both epochs show; the rest is an object of its own."""
         number = np.full(len(self) + 1, -1, dtype=np.int32)
-        inner = np.flatnonzero(is_within)
+        inner = np.flatnonzero(is_within).astype(np.int32)
         number[inner] = len(self) + np.arange(len(inner), dtype=np.int32)
         owner = self.surfaces.join(
             is_shared,
@@ -187,6 +193,21 @@ class _Cast:
             self.is_house[each],
             self.is_extension[each],
         )
+
+    def is_smooth(self, host: IntArray) -> IntArray:
+        """Where the points of each object go, (n + 1,), the last those of none: rough things (t,) of a plant are a part
+        of it and go back to their ``host``."""
+        n = len(self) - len(host)
+        goes_to = np.append(np.arange(len(self)), -1).astype(np.int32)
+        is_asked = np.arange(len(self)) >= n
+        is_rough: BoolArray = np.nan_to_num(roughness(self.surfaces, is_asked)) > _FOLIAGE_M
+        counts = np.bincount(
+            np.concatenate([side.owner[side.owner >= 0] for side in self.surfaces]), minlength=len(self)
+        )
+        is_rough &= counts >= _LEAST_FOLIAGE
+        is_rough &= self.object_class == ObjectClass.VEGETATION
+        goes_to[:-1][is_rough] = host[np.flatnonzero(is_rough) - n]
+        return goes_to
 
     @property
     def is_pair(self) -> BoolArray:
@@ -273,6 +294,7 @@ class Cue(NamedTuple):
     n_voxels: float
     volume_before: float
     volume_after: float
+    tall: float
 
 
 class Verdict(NamedTuple):
@@ -288,9 +310,10 @@ def _rows(evidence: Evidence, object_class: ByteArray) -> list[Cue]:
         evidence.n_voxels.after > 0,
         evidence.support.before,
         evidence.support.after,
-        *(getattr(evidence, name) for name in Cue._fields[5:-3]),
+        *(getattr(evidence, name) for name in Cue._fields[5:-4]),
         np.fmax(evidence.n_voxels.before, evidence.n_voxels.after),
         *evidence.volume,
+        np.fmax(evidence.height.before, evidence.height.after),
     )
     return [
         Cue(ObjectClass(code), *values)
@@ -299,7 +322,7 @@ def _rows(evidence: Evidence, object_class: ByteArray) -> list[Cue]:
 
 
 def _is_within(cue: Cue, params: ChangeParams) -> bool:
-    """Whether what one epoch shows stands in the midst of what the other shows: a lamp post where a tree was planted."""
+    """Whether what one epoch shows stands in the midst of what the other shows: a lamp where a tree was planted."""
     supports = cue.support_before, cue.support_after
     is_plain = cue.object_class in (ObjectClass.VEGETATION, ObjectClass.OTHER)
     is_pair = cue.is_before and cue.is_after
@@ -320,13 +343,25 @@ def _is_no_pair(cue: Cue, params: ChangeParams) -> bool:
 def _is_replaced(cast: _Cast, cues: list[Cue], is_open: Pair[BoolArray], params: ChangeParams) -> BoolArray:
     """Which vehicles stand where another one stood."""
     is_pair = np.array([cue.is_before and cue.is_after for cue in cues], dtype=np.bool_)
-    is_asked = is_pair & (cast.object_class == ObjectClass.MOBILE) & (params.replaced_m > 0)
+    is_loose = np.isin(cast.object_class, (ObjectClass.MOBILE, ObjectClass.OTHER))
+    is_large = np.array([cue.n_voxels >= _LEAST_VEHICLE for cue in cues], dtype=np.bool_)
+    is_asked = is_pair & is_loose & is_large & (params.replaced_m > 0)
     is_asked &= looks_like_vehicle(cast.surfaces, len(cast))
     off = shape_change(cast.surfaces, is_open, is_asked)
-    return np.asarray(off > np.fmax(params.replaced_m, _ROUGH * roughness(cast.surfaces, is_asked)))
+    rough = roughness(cast.surfaces, is_asked)
+    return np.asarray((off > np.fmax(params.replaced_m, _ROUGH * rough)) & (rough < _FOLIAGE_M))
 
 
-_ROUGH = 1.2
+_LEAST_FOLIAGE = 60
+"""Fused points of a piece of plant; what has less is rough whatever it is."""
+
+_FOLIAGE_M = 0.08
+"""Foliage is rougher than this, vehicles, bins and walls are not."""
+
+_LEAST_VEHICLE = 50
+"""Voxels of a vehicle."""
+
+_ROUGH = 1.0
 """A shape must be off by more than this many times its own roughness."""
 
 
@@ -340,8 +375,7 @@ def _verdict(
 ) -> Verdict:
     """Label of one object; ``is_apart``: it was matched, but the pair turned out to be two objects."""
     if not (cue.is_before and cue.is_after):
-        verdict = _unmatched(cue, is_apart, params, observability)
-        return _extension(cue, verdict, params) if is_part and cue.object_class == ObjectClass.BUILDING else verdict
+        return _unmatched(cue, is_apart, params, observability)
     if observability.is_enabled and cue.observability < observability.min_observability:
         return Verdict(
             ChangeLabel.UNDETERMINED,
@@ -366,12 +400,10 @@ def _new_part(cue: Cue, params: ChangeParams) -> Verdict | None:
     return Verdict(label, f"{large:.0f} m3 of building in a row, of which the {other} survey shows {small:.0f} m3")
 
 
-def _extension(cue: Cue, verdict: Verdict, params: ChangeParams) -> Verdict:
-    """A part that one survey lacks altogether, smaller than a building, is a change of the building."""
+def _extension(verdict: Verdict) -> Verdict:
+    """What was built onto a house has not been Added: the house grew."""
     label = {ChangeLabel.ADDED: ChangeLabel.INCREASED, ChangeLabel.REMOVED: ChangeLabel.DECREASED}.get(verdict.label)
-    if label is None or params.frontage_m == 0 or max(cue.volume_before, cue.volume_after) >= params.part_is_new_m3:
-        return verdict
-    return Verdict(label, f"a piece of the building: {verdict.reason}")
+    return verdict if label is None else Verdict(label, f"a piece of the building: {verdict.reason}")
 
 
 def _changed_houses(
@@ -405,7 +437,8 @@ def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: Ob
         return Verdict(
             label, f"what the {other} survey shows there is another object; it shares {support:.0%} of the surface"
         )
-    if support >= params.min_support:
+    is_hidden = params.needs_sight and cue.observability - support < _LEAST_EMPTY
+    if support >= params.min_support * (cue.observability if is_hidden else 1.0):
         return Verdict(
             ChangeLabel.UNCHANGED,
             f"{support:.0%} of its surface is in the {other} survey too, as part of other objects",
@@ -415,6 +448,10 @@ def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: Ob
         f"no match in the {other} survey, which shows {support:.0%} of its surface "
         f"and could have seen {cue.observability:.0%} of it",
     )
+
+
+_LEAST_EMPTY = 0.2
+"""Share of an object that the other survey must have seen empty, where it shows half of what it could see of it."""
 
 
 def _mobile(cue: Cue, params: ChangeParams) -> Verdict:
@@ -440,10 +477,18 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
     least_above = max(least, params.backing_share * cue.n_voxels)
     has_height = params.use_height and abs(cue.dh) > max(gate, height_m)  # NaN is never above
     has_volume = params.use_volume and abs(cue.dv_ratio) > ratio
-    is_raised = least == 0 or cue.gained_above >= least_above or cue.column_rise > max(gate, height_m / 2)
-    is_lowered = least == 0 or cue.lost_above >= least_above or cue.column_rise < -max(gate, height_m / 2)
+    # a top that moves by more than what hides a voxel leaves voxels behind
+    rise = cue.column_rise if not params.needs_sight or abs(cue.dh) < _HIDES_VOXEL * params.query_radius_m else math.nan
+    is_crown = params.needs_sight and is_green and cue.tall >= _LOW_M
+    enough = max(gate, height_m if is_crown else height_m / 2)
+    is_raised = least == 0 or cue.gained_above >= least_above or rise > enough
+    is_lowered = least == 0 or cue.lost_above >= least_above or rise < -enough
     rises = has_height and cue.dh > 0 and is_raised
     sinks = has_height and cue.dh < 0 and is_lowered
+    is_low = is_green and cue.tall < _LOW_M
+    if params.plant_rise_m > 0 and is_low and abs(cue.column_rise) < _HIDES_VOXEL * params.query_radius_m:
+        rises |= cue.column_rise > max(gate, params.plant_rise_m)
+        sinks |= cue.column_rise < -max(gate, params.plant_rise_m)
     noise = params.volume_sigmas * math.sqrt(cue.gained + cue.lost)
     has_volume = has_volume and abs(cue.gained - cue.lost) >= noise
     swells = has_volume and cue.dv_ratio > 0 and (least == 0 or cue.gained >= max(least, cue.lost))
@@ -467,6 +512,13 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
             label, f"surface moved {abs(cue.d_perp):.2f} m along its normal (limit {limit:.2f} m): {figures}"
         )
     return Verdict(ChangeLabel.UNCHANGED, f"no cue above its limit: {figures}")
+
+
+_LOW_M = 3.0
+"""Plants up to here have a top of their own, and no crown that sheds its leaves."""
+
+_HIDES_VOXEL = 1.5
+"""Query radii that a top may move without a voxel gained or lost."""
 
 
 def _named(is_height: bool, is_volume: bool) -> str:

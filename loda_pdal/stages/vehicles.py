@@ -32,7 +32,8 @@ _FAR_M = 1.0
 """Residual of points with nothing closer."""
 
 _LEAST_M = (1.2, 2.2, 1.1)
-"""Width, length and height of what can be a vehicle."""
+_MOST_M = (2.8, 7.0)
+"""Width, length and height of what can be a vehicle; larger are two of them, or something else."""
 
 _LEAST_FILL = 0.6
 _CELL_M = 0.5
@@ -104,14 +105,15 @@ def roughness(surfaces: Pair[Surface], is_asked: BoolArray) -> FloatArray:
 
 
 def looks_like_vehicle(surfaces: Pair[Surface], n: int) -> BoolArray:
-    """Which objects (n,) have the size of a vehicle in both epochs and fill their box: no wall, hedge or bin, and no two
-    of them in one piece."""
+    """Which objects (n,) have the size of a vehicle in both epochs and fill their box: no wall, hedge or bin, and not
+    two of them in one piece."""
     fits = np.ones(n, np.bool_)
     for side in surfaces:
         size = upright_boxes(side.xyz, side.owner, n).size
         width, length = np.sort(size[:, :2], axis=1).T
         filled = count_cells(side.xyz[:, :2], side.owner, n, _CELL_M) * _CELL_M**2
         fits &= (width > _LEAST_M[0]) & (length > _LEAST_M[1]) & (size[:, 2] > _LEAST_M[2])
+        fits &= (width < _MOST_M[0]) & (length < _MOST_M[1])
         fits &= filled > _LEAST_FILL * width * length
     return fits
 
