@@ -356,6 +356,13 @@ class InstanceParams(StageParams):
     vegetation_min_points: int = param(200, "raw points of the smallest vegetation instance", low=1, high=100000)
     vegetation_min_voxels: int = param(30, "fused points of the smallest vegetation instance", low=1, high=100000)
     splits_crowns: bool = param(True, "touching crowns are split at their height maxima")
+    twig_voxels: int = param(
+        120,
+        "fused points of the largest piece that is a trunk or twigs because it hangs on vegetation; larger ones are "
+        "other objects",
+        low=0,
+        high=1000000,
+    )
     mobile_eps_m: float = param(
         0.7, "DBSCAN radius in plan", unit="m", symbol="epsilon", low=0.1, high=10, is_length=True
     )
@@ -743,6 +750,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "mobile_min_points": 4,
             "mobile_min_voxels": 6,
             "other_min_voxels": 6,
+            "twig_voxels": 1000000,
         },
         "changes": {
             "voxel_m": 1.0,

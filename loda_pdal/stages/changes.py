@@ -23,7 +23,7 @@ from loda_pdal.stages.cues import Cells, Evidence, Surface, Voxels, cells_with_o
 from loda_pdal.stages.observability import Coverage
 from loda_pdal.stages.parts import Parts, dissolve, split_parts
 from loda_pdal.stages.things import split_things
-from loda_pdal.stages.vehicles import looks_like_vehicle, roughness, shape_change
+from loda_pdal.stages.vehicles import ONE_VEHICLE_M, looks_like_vehicle, roughness, shape_change
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,9 @@ def decide_changes(
         cast = cast.settled(voxels)
         cells = cast.cells(voxels, params)
     if params.thing_voxels > 0:
-        is_vehicle = (cast.object_class == ObjectClass.MOBILE) & looks_like_vehicle(cast.surfaces, len(cast))
+        is_vehicle = (cast.object_class == ObjectClass.MOBILE) & looks_like_vehicle(
+            cast.surfaces, len(cast), ONE_VEHICLE_M
+        )
         is_asked = cast.is_pair & (cast.object_class != ObjectClass.BUILDING) & ~is_vehicle
         owner, host = split_things(cells, cast.surfaces, is_asked, params)
         is_kept = cast.with_more(owner, host).is_smooth(host)
