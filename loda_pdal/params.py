@@ -374,13 +374,20 @@ class InstanceParams(StageParams):
     vegetation_min_points: int = param(200, "raw points of the smallest vegetation instance", low=1, high=100000)
     vegetation_min_voxels: int = param(30, "fused points of the smallest vegetation instance", low=1, high=100000)
     splits_crowns: bool = param(True, "touching crowns are split at their height maxima")
+    twig_voxels: int = param(
+        120,
+        "fused points of the largest piece that is a trunk or twigs because it hangs on vegetation; larger ones are "
+        "other objects",
+        low=0,
+        high=1000000,
+    )
     mobile_eps_m: float = param(
         0.7, "DBSCAN radius in plan", unit="m", symbol="epsilon", low=0.1, high=10, is_length=True
     )
     mobile_min_points: int = param(30, "DBSCAN core size in raw points", symbol="minPts", low=1, high=10000)
     mobile_min_voxels: int = param(20, "fused points of the smallest mobile instance", low=1, high=10000)
     ground_erosion_m: float = param(0.15, "erosion of the ground mask", unit="m", low=0, high=5)
-    other_min_voxels: int = param(12, "fused points of the smallest other object", low=1, high=10000)
+    other_min_voxels: int = param(5, "fused points of the smallest other object", low=1, high=10000)
 
 
 @dataclass(frozen=True)
@@ -437,6 +444,13 @@ class ChangeParams(StageParams):
     vegetation_iou: float = param(0.08, "smallest IoU of matched vegetation", low=0, high=1)
     vegetation_shift_m: float = param(2.0, "largest centroid shift of matched vegetation", unit="m", low=0, high=100)
     vegetation_height_m: float = param(0.35, "height change of vegetation", unit="m", low=0, high=100)
+    plant_rise_m: float = param(
+        0.25,
+        "median change of the tops of a plant's columns that is a change where the detection limit is less; 0: none is",
+        unit="m",
+        low=0,
+        high=100,
+    )
     vegetation_volume_ratio: float = param(0.18, "relative volume change of vegetation", low=0, high=10)
     mobile_iou: float = param(0.20, "IoU of an unchanged mobile object", low=0, high=1)
     mobile_shift_m: float = param(
@@ -459,8 +473,8 @@ class ChangeParams(StageParams):
     )
     within_share: float = param(
         0.2,
-        "a plant or other object of which the other survey shows less than this share is another one, and what it shows "
-        "there is a thing in its midst; 0: never",
+        "a plant or other object of which the other survey shows less than this share is another one, and what it "
+        "shows there is a thing in its midst; 0: never",
         low=0,
         high=1,
     )
@@ -483,14 +497,15 @@ class ChangeParams(StageParams):
     )
     needs_sight: bool = param(
         True,
-        "what is solid is gained or lost only where the other survey shows something beneath it and nothing of the same "
-        "object above it: else it was hidden",
+        "what is solid is gained or lost only where the other survey shows something beneath it and nothing of the "
+        "same object above it: else it was hidden",
     )
+    fair_tops: bool = param(True, "columns' tops are compared as if both epochs had equally many points in them")
     volume_sigmas: float = param(
         0.0, "gained less lost voxels must exceed this many times the root of their sum; 0: need not", low=0, high=100
     )
     replaced_m: float = param(
-        0.045,
+        0.06,
         "how far a quarter of a parked vehicle's surface must be off, after the best move, to make it another one; "
         "0: never",
         unit="m",
@@ -527,15 +542,15 @@ class ChangeParams(StageParams):
     )
     frontage_m: float = param(
         6.0,
-        "width of a house in a row: what is built onto a house changes it, and this much of a longer row; 0: only the part "
-        "changes",
+        "width of a house in a row: what is built onto a house changes it, and this much of a longer row; 0: only the "
+        "part changes",
         unit="m",
         low=0,
         high=100,
     )
     thing_voxels: int = param(
         5,
-        "occupancy voxels of the smallest thing that came or went beside what it is merged with; 0: none are looked for",
+        "occupancy voxels of the smallest thing that came or went beside what it is merged with; 0: none is looked for",
         low=0,
         high=10000,
     )
@@ -824,6 +839,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "mobile_min_points": 4,
             "mobile_min_voxels": 6,
             "other_min_voxels": 6,
+            "twig_voxels": 1000000,
         },
         "changes": {
             "voxel_m": 1.0,
@@ -840,6 +856,8 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "plant_width_m": 2.5,
             "needs_sight": False,
             "within_share": 0.0,
+            "plant_rise_m": 0.0,
+            "fair_tops": False,
             "thing_voxels": 0,
             "part_min_voxels": 24,
             "part_is_new_m3": 80.0,
@@ -862,7 +880,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "points_near_ground_are_ground": False,
             "building_top_m": 0.0,
         },
-        "instances": {"join_by_footprint": False, "splits_crowns": False},
+        "instances": {"join_by_footprint": False, "splits_crowns": False, "other_min_voxels": 12},
         "observability": {"is_enabled": False},
         "ground_changes": {"min_area_m2": 25.0},
         "changes": {
@@ -877,6 +895,8 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "min_expected_points": 0.0,
             "needs_sight": False,
             "within_share": 0.0,
+            "plant_rise_m": 0.0,
+            "fair_tops": False,
             "thing_voxels": 0,
             "replaced_m": 0.0,
         },

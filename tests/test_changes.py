@@ -35,20 +35,26 @@ def block(x: float, y: float, length: float, width: float, top: float) -> tuple[
     return np.concatenate([w[0] for w in walls]) + np.array([x, y, 0.0]), np.concatenate([w[1] for w in walls])
 
 
+GROUND = np.stack(np.meshgrid(np.arange(-5.0, 55.0, 0.25), np.arange(-5.0, 30.0, 0.25), [0.0]), -1).reshape(-1, 3)
+
+
 def surface(*parts: tuple[int, tuple[FloatArray, FloatArray]]) -> Surface:
-    """One epoch of numbered parts."""
-    if not parts:
-        none = np.zeros(0, np.int32)
-        return Surface(np.zeros((0, 3)), np.zeros((0, 3), np.float32), np.zeros(0), none, none, np.zeros(0, np.bool_))
+    """One epoch of numbered parts on level ground."""
+    parts = (*parts, (-1, (GROUND, np.tile((0, 0, 1), (len(GROUND), 1)))))
     xyz = np.concatenate([points for _, (points, _) in parts])
     normals = np.concatenate([n for _, (_, n) in parts]).astype(np.float32)
     owner = np.concatenate([np.full(len(points), number, np.int32) for number, (points, _) in parts])
-    return Surface(xyz, normals, xyz[:, 2].copy(), np.full(len(xyz), 5, np.int32), owner, np.ones(len(xyz), np.bool_))
+    return Surface(xyz, normals, xyz[:, 2].copy(), np.full(len(xyz), 5, np.int32), owner, owner >= 0)
+
+
+def joined(*parts: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Several parts as one."""
+    return np.concatenate([p for p, _ in parts]), np.concatenate([n for _, n in parts])
 
 
 def lod_everywhere(surfaces: Pair[Surface]) -> LodGrid:
     """The same limit in every occupied cell."""
-    xyz = np.concatenate([side.xyz for side in surfaces])
+    xyz = np.concatenate([side.xyz[side.is_surface] for side in surfaces])
     cells = np.unique(np.floor(xyz).astype(np.int32), axis=0)
     n = len(cells)
     return LodGrid(
@@ -92,7 +98,7 @@ def test_a_house_is_labelled_by_what_was_done_to_it(
     after: tuple[FloatArray, FloatArray], expected: ChangeLabel
 ) -> None:
     found = decide(surface((0, HOUSE)), surface((0, after)), ObjectClass.BUILDING)
-    assert labels(found) == [expected]
+    assert set(labels(found)) == {expected}
     assert 0 <= found.confidence[0] <= 1
 
 
@@ -145,6 +151,62 @@ def test_one_house_of_a_terrace_changes_alone() -> None:
     assert x.max() <= 18.5
 
 
+def test_a_porch_changes_its_house_and_hides_the_wall_behind() -> None:
+    porch = block(2, -1.5, 2.5, 1.5, 2.75)
+    inside = (HOUSE[0][:, 0] > 2) & (HOUSE[0][:, 0] < 4.5) & (HOUSE[0][:, 1] == 0) & (HOUSE[0][:, 2] < 2.75)
+    hidden = (HOUSE[0][~inside], HOUSE[1][~inside])
+    there = decide(surface((0, HOUSE)), surface((0, joined(hidden, porch))), ObjectClass.BUILDING)
+    assert labels(there) == [ChangeLabel.INCREASED] * 2
+    house, part = (0, 1) if there.parent[1] == 0 else (1, 0)
+    assert there.parent[part] == house
+    assert there.reason[house].startswith("a part of it changed")
+    assert np.all(there.owner.before[: len(HOUSE[0])][HOUSE[0][:, 1] > 2] == house)
+    back = decide(surface((0, joined(hidden, porch))), surface((0, HOUSE)), ObjectClass.BUILDING)
+    assert [label.swapped for label in labels(there)] == labels(back)
+
+
+def test_a_porch_on_a_row_changes_one_frontage_of_it() -> None:
+    row = block(0, 0, 40, 8, 6)
+    found = decide(surface((0, row)), surface((0, joined(row, block(20, -1.5, 2.5, 1.5, 2.75)))), ObjectClass.BUILDING)
+    assert sorted(labels(found)) == [ChangeLabel.UNCHANGED, ChangeLabel.INCREASED, ChangeLabel.INCREASED]
+    x = row[0][:, 0]
+    is_changed = found.label[found.owner.before[: len(x)]] == ChangeLabel.INCREASED
+    assert x[is_changed].min() == pytest.approx(18.25, abs=0.5)
+    assert x[is_changed].max() == pytest.approx(24.25, abs=0.5)
+
+
+def test_one_of_two_vehicles_in_one_piece_leaves_alone() -> None:
+    one, other = block(0, 0, 4.5, 1.8, 1.5), block(5.0, 0.0, 4.5, 1.8, 1.5)
+    before, after = surface((0, joined(one, other))), surface((0, one))
+    there, back = decide(before, after, ObjectClass.MOBILE), decide(after, before, ObjectClass.MOBILE)
+    assert labels(there) == [ChangeLabel.UNCHANGED, ChangeLabel.REMOVED]
+    assert labels(back) == [ChangeLabel.UNCHANGED, ChangeLabel.ADDED]
+
+
+def test_a_lamp_stays_where_a_tree_is_planted_about_it() -> None:
+    lamp, crown = block(0, 0, 0.25, 0.25, 5), block(-2, -2, 4.5, 4.5, 7)
+    found = decide(surface((0, lamp)), surface((0, joined(lamp, crown))), ObjectClass.VEGETATION)
+    assert sorted(labels(found)) == [ChangeLabel.UNCHANGED, ChangeLabel.ADDED]
+    assert labels(found)[found.owner.before[0]] == ChangeLabel.UNCHANGED
+
+
+@pytest.mark.parametrize(
+    ("after", "is_other"),
+    [
+        (block(0.4, 0.05, 4.5, 1.8, 1.5), False),
+        (block(0, 0, 4.5, 1.8, 1.7), True),
+    ],
+    ids=["parked again", "higher"],
+)
+def test_another_vehicle_in_the_same_slot_is_told_by_its_shape(
+    after: tuple[FloatArray, FloatArray], is_other: bool
+) -> None:
+    car = block(0, 0, 4.5, 1.8, 1.5)
+    found = decide(surface((0, car)), surface((0, after)), ObjectClass.MOBILE)
+    expected = [ChangeLabel.ADDED, ChangeLabel.REMOVED] if is_other else [ChangeLabel.UNCHANGED]
+    assert sorted(labels(found)) == expected
+
+
 def test_vegetation_grows_above_its_own_limit_only() -> None:
     shrub = block(0, 0, 4, 4, 3)
     for top, expected in ((3.2, ChangeLabel.UNCHANGED), (4.5, ChangeLabel.INCREASED)):
@@ -187,6 +249,8 @@ def test_points_may_come_in_any_order() -> None:
 
 
 def test_nothing_gives_nothing() -> None:
-    found = decide(surface(), surface())
-    assert len(found) == 0
+    none = surface().owner[:0]
+    nothing = Surface(np.zeros((0, 3)), np.zeros((0, 3), np.float32), np.zeros(0), none, none, np.zeros(0, np.bool_))
+    for found in (decide(surface(), surface()), decide(nothing, nothing)):
+        assert len(found) == 0
     assert found.reason == ()

@@ -81,6 +81,12 @@ def test_new_owners_need_no_new_sampling(surfaces: Pair[Surface]) -> None:
     assert np.array_equal(voxels.displacement, sampled(other).displacement, equal_nan=True)
 
 
+def top_of_as_many(z: list[float], other: list[float]) -> float:
+    """Mean rank of the highest of as many heights as ``other`` has, drawn from those of ``z``; the highest of fewer."""
+    rank = (len(z) + 1) / (min(len(z), len(other)) + 1) - 1
+    return float(np.interp(rank, range(len(z)), sorted(z, reverse=True)))
+
+
 @pytest.mark.parametrize("seen", [None, half_seen()], ids=["all seen", "half seen"])
 def test_tops_and_rise_of_the_columns_as_a_loop_finds_them(
     surfaces: Pair[Surface], seen: Pair[Coverage] | None
@@ -89,23 +95,26 @@ def test_tops_and_rise_of_the_columns_as_a_loop_finds_them(
     cells = cells_with_owners(voxels, surfaces, N_OBJECTS, PARAMS)
     evidence = weigh(cells, surfaces, N_OBJECTS, PARAMS)
 
-    tops: Pair[dict[tuple[int, ...], float]] = Pair({}, {})
+    tops: Pair[dict[tuple[int, ...], list[float]]] = Pair({}, {})
     others = seen.swapped if seen else Pair(None, None)
     for side, other, top in zip(surfaces, others, tops, strict=True):
         is_open = other.at(side.xyz) if other else np.ones(len(side.xyz), bool)
         for point, owner in zip(side.xyz[is_open], side.owner[is_open].tolist(), strict=True):
             if owner >= 0:
-                column = (owner, *voxel_of(point)[:2])
-                top[column] = max(top.get(column, -np.inf), point[2])
+                top.setdefault((owner, *voxel_of(point)[:2]), []).append(point[2])
     heights = Pair({}, {})
     for side, height in zip(cells.owner, heights, strict=True):
         for cell, owner in zip(voxels.cell, side.tolist(), strict=True):
             height.setdefault((owner, *cell[:2].tolist()), []).append((cell[2] + 0.5) * PARAMS.voxel_m)
 
     for o in range(N_OBJECTS):
-        summit = [np.quantile(z, 0.95) if (z := [v for c, v in t.items() if c[0] == o]) else np.nan for t in tops]
+        summit = [np.quantile(z, 0.95) if (z := [max(v) for c, v in t.items() if c[0] == o]) else np.nan for t in tops]
         assert evidence.dh[o] == pytest.approx(summit[1] - summit[0], nan_ok=True)
-        rise = [tops.after[c] - tops.before[c] for c in tops.before if c[0] == o and c in tops.after]
+        shared = [c for c in tops.before if c[0] == o and c in tops.after]
+        rise = [
+            top_of_as_many(tops.after[c], tops.before[c]) - top_of_as_many(tops.before[c], tops.after[c])
+            for c in shared
+        ]
         assert evidence.column_rise[o] == pytest.approx(np.median(rise) if len(rise) >= 8 else np.nan, nan_ok=True)
         shared = [c for c in heights.before if c[0] == o and c in heights.after]
         mean = [np.mean([z for c in shared for z in height[c]]) if shared else np.nan for height in heights]

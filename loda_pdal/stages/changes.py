@@ -23,7 +23,7 @@ from loda_pdal.stages.cues import Cells, Evidence, Surface, Voxels, cells_with_o
 from loda_pdal.stages.observability import Coverage
 from loda_pdal.stages.parts import Parts, dissolve, largest_regions, split_parts
 from loda_pdal.stages.things import split_things
-from loda_pdal.stages.vehicles import looks_like_vehicle, roughness, shape_change
+from loda_pdal.stages.vehicles import ONE_VEHICLE_M, looks_like_vehicle, roughness, shape_change
 
 
 @dataclass(frozen=True)
@@ -118,9 +118,13 @@ def decide_changes(
         cast = cast.settled(voxels)
         cells = cast.cells(voxels, params)
     if params.thing_voxels > 0:
-        is_vehicle = (cast.object_class == ObjectClass.MOBILE) & looks_like_vehicle(cast.surfaces, len(cast))
+        is_vehicle = (cast.object_class == ObjectClass.MOBILE) & looks_like_vehicle(
+            cast.surfaces, len(cast), ONE_VEHICLE_M
+        )
         is_asked = cast.is_pair & (cast.object_class != ObjectClass.BUILDING) & ~is_vehicle
         owner, host = split_things(cells, cast.surfaces, is_asked, params)
+        is_kept = cast.with_more(owner, host).is_smooth(host)
+        owner = owner.map(lambda side: is_kept[side])
         cast = cast.with_more(owner, host).settled(voxels)
         cells = cast.cells(voxels, params)
     if params.find_parts:
@@ -129,19 +133,23 @@ def decide_changes(
     evidence = weigh(cells, cast.surfaces, len(cast), params)
     regions = largest_regions(cells, len(cast), params)
     surfaces, object_class, parent, is_apart = cast.surfaces, cast.object_class, cast.parent, cast.is_apart
+    is_smooth = roughness(cast.surfaces, cast.is_extension) < _FOLIAGE_M
     carrier = np.append(cast.is_house, False)[parent] & cast.is_extension
     cues = _rows(evidence, object_class, regions)
+    is_part = (parent >= 0) & ~cast.is_extension
     verdicts = [
         _verdict(cue, apart, part, params, observability)
-        for cue, apart, part in zip(cues, is_apart.tolist(), (parent >= 0).tolist(), strict=True)
+        for cue, apart, part in zip(cues, is_apart.tolist(), is_part.tolist(), strict=True)
     ]
+    for i in np.flatnonzero(cast.is_extension).tolist():
+        verdicts[i] = _extension(verdicts[i])
     raw = np.array(
         [
             _raw(cue, v, apart, params, confidence)
             for cue, v, apart in zip(cues, verdicts, is_apart.tolist(), strict=True)
         ]
     )
-    for i, part in _changed_houses(verdicts, parent, carrier, evidence.dv).items():
+    for i, part in _changed_houses(verdicts, parent, carrier & is_smooth, evidence.dv).items():
         verdicts[i] = Verdict(verdicts[part].label, f"a part of it changed: {verdicts[part].reason}")
         raw[i] = raw[part]
     sure = [calibrated(score, v.label, confidence) for score, v in zip(raw.tolist(), verdicts, strict=True)]
@@ -188,7 +196,7 @@ class _Cast:
     def without_surroundings(self, is_within: BoolArray, is_shared: Pair[BoolArray]) -> _Cast:
         """Of the marked objects (k,) keep what both epochs show; the rest is an object of its own."""
         number = np.full(len(self) + 1, -1, dtype=np.int32)
-        inner = np.flatnonzero(is_within)
+        inner = np.flatnonzero(is_within).astype(np.int32)
         number[inner] = len(self) + np.arange(len(inner), dtype=np.int32)
         owner = self.surfaces.join(
             is_shared,
@@ -207,6 +215,21 @@ class _Cast:
             self.is_house[each],
             self.is_extension[each],
         )
+
+    def is_smooth(self, host: IntArray) -> IntArray:
+        """Where the points of each object go, (n + 1,), the last those of none: rough things (t,) of a plant are a part
+        of it and go back to their ``host``."""
+        n = len(self) - len(host)
+        goes_to = np.append(np.arange(len(self)), -1).astype(np.int32)
+        is_asked = np.arange(len(self)) >= n
+        is_rough: BoolArray = np.nan_to_num(roughness(self.surfaces, is_asked)) > _FOLIAGE_M
+        counts = np.bincount(
+            np.concatenate([side.owner[side.owner >= 0] for side in self.surfaces]), minlength=len(self)
+        )
+        is_rough &= counts >= _LEAST_FOLIAGE
+        is_rough &= self.object_class == ObjectClass.VEGETATION
+        goes_to[:-1][is_rough] = host[np.flatnonzero(is_rough) - n]
+        return goes_to
 
     @property
     def is_pair(self) -> BoolArray:
@@ -296,6 +319,7 @@ class Cue(NamedTuple):
     volume_after: float
     cut_m3: float
     grown_m3: float
+    tall: float
 
 
 class Verdict(NamedTuple):
@@ -311,10 +335,11 @@ def _rows(evidence: Evidence, object_class: ByteArray, regions: Pair[FloatArray]
         evidence.n_voxels.after > 0,
         evidence.support.before,
         evidence.support.after,
-        *(getattr(evidence, name) for name in Cue._fields[5:-5]),
+        *(getattr(evidence, name) for name in Cue._fields[5:-6]),
         np.fmax(evidence.n_voxels.before, evidence.n_voxels.after),
         *evidence.volume,
         *regions,
+        np.fmax(evidence.height.before, evidence.height.after),
     )
     return [
         Cue(ObjectClass(code), *values)
@@ -323,7 +348,7 @@ def _rows(evidence: Evidence, object_class: ByteArray, regions: Pair[FloatArray]
 
 
 def _is_within(cue: Cue, params: ChangeParams) -> bool:
-    """Whether what one epoch shows stands in the midst of what the other shows: a lamp post where a tree was planted."""
+    """Whether what one epoch shows stands in the midst of what the other shows: a lamp where a tree was planted."""
     supports = cue.support_before, cue.support_after
     is_plain = cue.object_class in (ObjectClass.VEGETATION, ObjectClass.OTHER)
     is_pair = cue.is_before and cue.is_after
@@ -344,10 +369,13 @@ def _is_no_pair(cue: Cue, params: ChangeParams) -> bool:
 def _is_replaced(cast: _Cast, cues: list[Cue], is_open: Pair[BoolArray], params: ChangeParams) -> BoolArray:
     """Which vehicles stand where another one stood."""
     is_pair = np.array([cue.is_before and cue.is_after for cue in cues], dtype=np.bool_)
-    is_asked = is_pair & (cast.object_class == ObjectClass.MOBILE) & (params.replaced_m > 0)
+    is_loose = np.isin(cast.object_class, (ObjectClass.MOBILE, ObjectClass.OTHER))
+    is_large = np.array([cue.n_voxels >= _LEAST_VEHICLE for cue in cues], dtype=np.bool_)
+    is_asked = is_pair & is_loose & is_large & (params.replaced_m > 0)
     is_asked &= looks_like_vehicle(cast.surfaces, len(cast))
     off = shape_change(cast.surfaces, is_open, is_asked)
-    is_another = off > np.fmax(params.replaced_m, _ROUGH * roughness(cast.surfaces, is_asked))
+    rough = roughness(cast.surfaces, is_asked)
+    is_another = (off > np.fmax(params.replaced_m, _ROUGH * rough)) & (rough < _FOLIAGE_M)
     if params.replaced_top_m > 0:
         rise = np.array([abs(cue.dh) for cue in cues])
         is_mobile = is_pair & (cast.object_class == ObjectClass.MOBILE)
@@ -355,7 +383,16 @@ def _is_replaced(cast: _Cast, cues: list[Cue], is_open: Pair[BoolArray], params:
     return np.asarray(is_another)
 
 
-_ROUGH = 1.2
+_LEAST_FOLIAGE = 60
+"""Fused points of a piece of plant; what has less is rough whatever it is."""
+
+_FOLIAGE_M = 0.08
+"""Foliage is rougher than this, vehicles, bins and walls are not."""
+
+_LEAST_VEHICLE = 50
+"""Voxels of a vehicle."""
+
+_ROUGH = 1.0
 """A shape must be off by more than this many times its own roughness."""
 
 
@@ -370,7 +407,7 @@ def _verdict(
     """Label of one object; ``is_apart``: it was matched, but the pair turned out to be two objects."""
     if not (cue.is_before and cue.is_after):
         alone = _unmatched(cue, is_apart, params, observability)
-        return _extension(cue, alone, params) if is_part and cue.object_class == ObjectClass.BUILDING else alone
+        return _extension(alone) if is_part and _is_piece(cue, params) else alone
     if observability.is_enabled and cue.observability < observability.min_observability:
         return Verdict(
             ChangeLabel.UNDETERMINED,
@@ -406,16 +443,16 @@ def _new_part(cue: Cue, params: ChangeParams) -> Verdict | None:
     return None
 
 
-def _extension(cue: Cue, verdict: Verdict, params: ChangeParams) -> Verdict:
-    """A part that one survey lacks altogether, smaller than a building, is a change of the building."""
-    volume = max(cue.volume_before, cue.volume_after)
-    if volume >= params.part_is_new_m3:
-        return verdict
-    if verdict.label == ChangeLabel.ADDED:
-        return Verdict(ChangeLabel.INCREASED, f"{volume:.0f} m3 built onto the building: {verdict.reason}")
-    if verdict.label == ChangeLabel.REMOVED:
-        return Verdict(ChangeLabel.DECREASED, f"{volume:.0f} m3 of the building taken away: {verdict.reason}")
-    return verdict
+def _extension(verdict: Verdict) -> Verdict:
+    """What was built onto a house has not been Added: the house grew."""
+    label = {ChangeLabel.ADDED: ChangeLabel.INCREASED, ChangeLabel.REMOVED: ChangeLabel.DECREASED}.get(verdict.label)
+    return verdict if label is None else Verdict(label, f"a piece of the building: {verdict.reason}")
+
+
+def _is_piece(cue: Cue, params: ChangeParams) -> bool:
+    """Whether a part of a body that one survey alone shows is too small to be a building of its own."""
+    is_body = params.fills_buildings and cue.object_class == ObjectClass.BUILDING
+    return is_body and max(cue.volume_before, cue.volume_after) < params.part_is_new_m3
 
 
 def _changed_houses(
@@ -452,7 +489,8 @@ def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: Ob
         return Verdict(
             label, f"what the {other} survey shows there is another object; it shares {support:.0%} of the surface"
         )
-    if support >= params.min_support:
+    is_hidden = params.needs_sight and cue.observability - support < _LEAST_EMPTY
+    if support >= params.min_support * (cue.observability if is_hidden else 1.0):
         return Verdict(
             ChangeLabel.UNCHANGED,
             f"{support:.0%} of its surface is in the {other} survey too, as part of other objects",
@@ -467,6 +505,10 @@ def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: Ob
 def _hidden(cue: Cue) -> str:
     """How much of an object that was not seen had something before it, where rays say so."""
     return f"; {cue.hidden:.0%} was hidden behind what stood nearer to the sensor" if cue.hidden > 0 else ""
+
+
+_LEAST_EMPTY = 0.2
+"""Share of an object that the other survey must have seen empty, where it shows half of what it could see of it."""
 
 
 def _mobile(cue: Cue, params: ChangeParams) -> Verdict:
@@ -495,15 +537,23 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
         dh = cue.column_rise  # most of the roof moved, if not its highest part
     has_height = params.use_height and abs(dh) > max(gate, height_m)  # NaN is never above
     has_volume = params.use_volume and abs(cue.dv_ratio) > ratio
-    is_raised = least == 0 or cue.gained_above >= least_above or cue.column_rise > max(gate, height_m / 2)
-    is_lowered = least == 0 or cue.lost_above >= least_above or cue.column_rise < -max(gate, height_m / 2)
-    rises = has_height and dh > 0 and is_raised
-    sinks = has_height and dh < 0 and is_lowered
     if params.fills_buildings and cue.object_class == ObjectClass.BUILDING:
         # edges of roofs come and go with the sampling: a body changed where a piece of it did, or most of its roof
         is_solid = max(cue.grown_m3, cue.cut_m3) > 0
         has_volume &= is_solid
         has_height &= is_solid or abs(cue.column_rise) > max(gate, height_m)
+    # a top that moves by more than what hides a voxel leaves voxels behind
+    rise = cue.column_rise if not params.needs_sight or abs(cue.dh) < _HIDES_VOXEL * params.query_radius_m else math.nan
+    is_crown = params.needs_sight and is_green and cue.tall >= _LOW_M
+    enough = max(gate, height_m if is_crown else height_m / 2)
+    is_raised = least == 0 or cue.gained_above >= least_above or rise > enough
+    is_lowered = least == 0 or cue.lost_above >= least_above or rise < -enough
+    rises = has_height and dh > 0 and is_raised
+    sinks = has_height and dh < 0 and is_lowered
+    is_low = is_green and cue.tall < _LOW_M
+    if params.plant_rise_m > 0 and is_low and abs(cue.column_rise) < _HIDES_VOXEL * params.query_radius_m:
+        rises |= cue.column_rise > max(gate, params.plant_rise_m)
+        sinks |= cue.column_rise < -max(gate, params.plant_rise_m)
     noise = params.volume_sigmas * math.sqrt(cue.gained + cue.lost)
     has_volume = has_volume and abs(cue.gained - cue.lost) >= noise
     swells = has_volume and cue.dv_ratio > 0 and (least == 0 or cue.gained >= max(least, cue.lost))
@@ -531,6 +581,13 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
             label, f"surface moved {abs(cue.d_perp):.2f} m along its normal (limit {limit:.2f} m): {figures}"
         )
     return Verdict(ChangeLabel.UNCHANGED, f"no cue above its limit: {figures}")
+
+
+_LOW_M = 3.0
+"""Plants up to here have a top of their own, and no crown that sheds its leaves."""
+
+_HIDES_VOXEL = 1.5
+"""Query radii that a top may move without a voxel gained or lost."""
 
 
 def _named(is_height: bool, is_volume: bool) -> str:

@@ -5,8 +5,8 @@ instance in one survey and three in the other, a hedge is vegetation here and `o
 assignment leaves over, but whose surface the other survey shows too, joins the object that occupies the same space
 (METHOD 2b); only what occupies space of its own can be Added or Removed.
 
-And where it is of another kind than that object (a bin that one survey shows beside a vehicle and the other in one piece
-with it), the object gives up the points that belong to it instead: the survey that tells things apart is right.
+And where it is of another kind than that object (a bin that one survey shows beside a vehicle and the other in one
+piece with it), the object gives up the points that belong to it instead: the survey that tells things apart is right.
 """
 
 from __future__ import annotations
@@ -198,8 +198,8 @@ def _left_over(votes: _Votes, matched: IntArray) -> IntArray:
 def _stands_apart(left: IntArray, votes: Pair[_Votes], kinds: Pair[ByteArray]) -> BoolArray:
     """Which of the instances left over are things of their own, merged with something else in the other epoch.
 
-    Not those of the same kind as the instance that occupies their space (crowns and houses are taken apart at will), and
-    not those that occupy each other's space: they are one thing with two names.
+    Not those of the same kind as the instance that occupies their space (crowns and houses are taken apart at will),
+    and not those that occupy each other's space: they are one thing with two names.
     """
     host = votes.before.partner[left]
     is_mutual = (votes.after.partner[host] == left) & (votes.after.support[host] >= _MIN_SHARED)

@@ -321,8 +321,8 @@ def cells_with_owners(
 ) -> Cells:
     """The voxels with their owners among objects 0 to ``n - 1``.
 
-    Of those that are solid, (n,) bool, what has other surface of the object above it in the other epoch, or no return of
-    that epoch beneath it, was hidden there and not seen: a wall behind a new porch has not gone.
+    Of those that are solid, (n,) bool, what has other surface of the object above it in the other epoch, or no return
+    of that epoch beneath it, was hidden there and not seen: a wall behind a new porch has not gone.
     """
     holder, points = voxels.holders(surfaces, n)
     owner, n_raw = (Pair(*np.ascontiguousarray(values.T)) for values in (holder, points))
@@ -463,7 +463,7 @@ def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -
         d_typical=np.where(is_sampled, samples.median(np.abs(displacement)), np.nan),
         gained_above=_count(own.after, cells.is_gained & _is_above(z, own.after, summit.before), n, cells.odds.before),
         lost_above=_count(own.before, cells.is_lost & _is_above(z, own.before, summit.after), n, cells.odds.after),
-        column_rise=_column_rise(voxels, surfaces, n),
+        column_rise=_column_rise(voxels, surfaces, n, is_fair=params.fair_tops),
         lod95=Groups(owner, n).median(voxels.lod95[voxel]),
         observability=(n_known.before + n_known.after) / np.maximum(n_voxels.before + n_voxels.after, 1),
         hidden=(n_hidden.before + n_hidden.after) / np.maximum(n_voxels.before + n_voxels.after, 1),
@@ -549,11 +549,11 @@ def _summit(owner: IntArray, top: FloatArray, n: int) -> FloatArray:
     return Groups(owner[is_known], n).quantile(top[is_known], 0.95)
 
 
-def _column_rise(voxels: Voxels, surfaces: Pair[Surface], n: int) -> FloatArray:
+def _column_rise(voxels: Voxels, surfaces: Pair[Surface], n: int, *, is_fair: bool) -> FloatArray:
     """Median change of the columns' tops (n,) m over the columns that both epochs have.
 
-    The more points, the higher the highest of them: where an epoch has m points of the object in a column and the other
-    k < m, its top is that of k points drawn from the m, which lies at rank (m + 1) / (k + 1) in the mean.
+    The more points, the higher the highest of them: to be fair, where an epoch has m points of the object in a column
+    and the other k < m, its top is that of k points drawn from the m, which lies at rank (m + 1) / (k + 1) in the mean.
     """
     owner = voxels.of_points([side.owner for side in surfaces])
     kept = np.flatnonzero((owner >= 0) & voxels.is_open)
@@ -568,7 +568,8 @@ def _column_rise(voxels: Voxels, surfaces: Pair[Surface], n: int) -> FloatArray:
     before = np.flatnonzero((key[first[:-1]] % 2 == 0) & (key[first[1:]] == key[first[:-1]] + 1))
     tops = []
     for own, other in ((before, before + 1), (before + 1, before)):
-        rank = np.maximum((count[own] + 1) / (np.minimum(count[own], count[other]) + 1), 1.0) - 1.0
+        fewer = np.minimum(count[own], count[other]) if is_fair else count[own]
+        rank = (count[own] + 1) / (fewer + 1) - 1.0
         low = np.minimum(rank.astype(np.int64), count[own] - 1)
         high = np.minimum(low + 1, count[own] - 1)
         tops.append(z[first[own] + low] + (rank - low) * (z[first[own] + high] - z[first[own] + low]))

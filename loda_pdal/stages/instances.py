@@ -345,7 +345,7 @@ def _judge_clusters(
         if len(green):
             found, _ = nearest(xyz[green], xyz[loose[rest]], params.building_gap_m)
             n_near = Groups(piece, len(judged)).sum(found >= 0)
-        is_twig = ~is_vehicle & (n_near > 0)
+        is_twig = ~is_vehicle & (n_near > 0) & (np.bincount(piece, minlength=len(judged)) <= params.twig_voxels)
         code[rest] = np.select(
             [is_vehicle[piece], is_twig[piece]], [ObjectClass.MOBILE, ObjectClass.VEGETATION], ObjectClass.OTHER
         )

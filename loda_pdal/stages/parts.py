@@ -254,8 +254,8 @@ def _claim(
     is_plant: BoolArray,
     params: ChangeParams,
 ) -> tuple[Int64Array, Int64Array, IntArray, BoolArray, BoolArray]:
-    """Columns (k, 3) that parts take, the part of each, and for each part its parent, whether it is a house, and whether
-    it is built onto one.
+    """Columns (k, 3) that parts take, the part of each, and for each part its parent, whether it is a house, and
+    whether it is built onto one.
 
     The largest region comes first. The parent of a part in a house that is a part itself, number p, is ``-1 - p``.
     """
@@ -268,7 +268,7 @@ def _claim(
         first, last = start[region.parent], start[region.parent + 1]
         is_inside = _under(region.columns, rows[first:last, 1:], fills_hull=not params.fills_buildings)
         is_in_row = has_houses[region.parent] and is_long[region.parent]
-        is_new = has_houses[region.parent] and region.share_new > 0.5
+        is_new = is_in_row and region.share_new > 0.5
         is_new = is_new and region.n_voxels * params.voxel_m**3 > params.part_is_new_m3
         most_of = 1.0 if is_new or is_plant[region.parent] else _MOST_OF_ROW if is_in_row else _MOST_OF
         if np.count_nonzero(is_inside) > most_of * (last - first):
@@ -303,7 +303,7 @@ def _claim(
 
 
 def _house_about(region: Int64Array, columns: Int64Array, params: ChangeParams) -> BoolArray:
-    """Which columns (k, 2) of a row of houses are the house that has the region: one frontage of the row, all through."""
+    """Which columns (k, 2) of a row of houses are the house that has the region: one frontage of it, all through."""
     near, reach = params.frontage_m / params.voxel_m, params.part_of_length_m / params.voxel_m
     middle = (region.min(axis=0) + region.max(axis=0)) / 2
     offset = columns - middle

@@ -1,7 +1,7 @@
 """Things that came or went right beside others: one object with them in one epoch, or in both (METHOD 2b).
 
-A bin beside a vehicle, a sign in a hedge, one more vehicle in a row of them: what stands on the ground, in columns of its
-own, where the other survey shows the ground and nothing of the object, is no growth of its neighbour.
+A bin beside a vehicle, a sign in a hedge, one more vehicle in a row of them: what stands on the ground, in columns of
+its own, where the other survey shows the ground and nothing of the object, is no growth of its neighbour.
 """
 
 from __future__ import annotations

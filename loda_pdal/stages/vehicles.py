@@ -6,6 +6,8 @@ again, half a metre on. So each is moved and turned until it fits, and what then
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from loda_pdal.kernels.neighbours import knn, nearest
@@ -33,6 +35,9 @@ _FAR_M = 1.0
 
 _LEAST_M = (1.2, 2.2, 1.1)
 """Width, length and height of what can be a vehicle."""
+
+ONE_VEHICLE_M = (2.8, 7.0)
+"""Width and length beyond which it is two of them, or something else."""
 
 _LEAST_FILL = 0.6
 _CELL_M = 0.5
@@ -103,15 +108,18 @@ def roughness(surfaces: Pair[Surface], is_asked: BoolArray) -> FloatArray:
     return np.asarray(np.fmax.reduce(rough))
 
 
-def looks_like_vehicle(surfaces: Pair[Surface], n: int) -> BoolArray:
-    """Which objects (n,) have the size of a vehicle in both epochs and fill their box: no wall, hedge or bin, and no two
-    of them in one piece."""
+def looks_like_vehicle(
+    surfaces: Pair[Surface], n: int, most_m: tuple[float, float] = (math.inf, math.inf)
+) -> BoolArray:
+    """Which objects (n,) are as large as a vehicle in both epochs, but no wider and longer than ``most_m``, and fill
+    their box: no wall, hedge or bin."""
     fits = np.ones(n, np.bool_)
     for side in surfaces:
         size = upright_boxes(side.xyz, side.owner, n).size
         width, length = np.sort(size[:, :2], axis=1).T
         filled = count_cells(side.xyz[:, :2], side.owner, n, _CELL_M) * _CELL_M**2
         fits &= (width > _LEAST_M[0]) & (length > _LEAST_M[1]) & (size[:, 2] > _LEAST_M[2])
+        fits &= (width < most_m[0]) & (length < most_m[1])
         fits &= filled > _LEAST_FILL * width * length
     return fits
 
