@@ -187,21 +187,31 @@ class Cells:
 
     @property
     def bare_columns(self) -> Pair[BoolArray]:
-        """Voxels in whose whole column that epoch saw, and has no surface in reach of any occupied voxel."""
+        """Voxels in whose columns that epoch saw, and shows next to nothing of what the other epoch has there."""
         first = self.voxels.columns[:-1]
         size = np.diff(self.voxels.columns)
 
-        def is_bare(near: BoolArray, seen: BoolArray) -> BoolArray:
+        def is_bare(near: BoolArray, seen: BoolArray, others: IntArray) -> BoolArray:
             if len(near) == 0:
                 return near
-            return np.repeat(~np.logical_or.reduceat(near, first), size) & seen
+            shown = np.add.reduceat((near & (others >= 0)).astype(np.int64), first)
+            held = np.add.reduceat((others >= 0).astype(np.int64), first)
+            return np.repeat(shown <= _NEXT_TO_NOTHING * held, size) & seen
 
-        return self.is_near.join(self.is_seen, is_bare)
+        own = self.owner.swapped
+        return Pair(
+            is_bare(self.is_near.before, self.is_seen.before, own.before),
+            is_bare(self.is_near.after, self.is_seen.after, own.after),
+        )
 
     @property
     def is_common(self) -> BoolArray:
         """Both epochs have a surface here."""
         return self.is_near.before & self.is_near.after
+
+
+_NEXT_TO_NOTHING = 0.3
+"""Share of a column that may be shown all the same: a car beneath a tree that was felled."""
 
 
 @dataclass(frozen=True)
