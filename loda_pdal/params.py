@@ -554,6 +554,13 @@ class ChangeParams(StageParams):
         low=0,
         high=10000,
     )
+    raised_m: float = param(
+        0.3,
+        "what one survey calls ground shows the other's thing from this height above the lower ground model; 0: never",
+        unit="m",
+        low=0,
+        high=10,
+    )
     part_is_new_m3: float = param(
         16.0,
         "a part of a building that only one survey has, and as large as this, is a building that was Added or Removed",
@@ -900,6 +907,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "fair_tops": False,
             "thing_voxels": 0,
             "replaced_m": 0.0,
+            "raised_m": 0.0,
         },
     },
 }

@@ -279,7 +279,7 @@ def label_objects(
     """Cues and change labels (section 4.3); ``sight`` has the rays of epochs whose trajectory is known."""
 
     def surface(cloud: VoxelCloud, g: Ground, s: Segments, i: Instances, own: IntArray) -> Surface:
-        is_surface = i.classification != ObjectClass.GROUND
+        is_surface = (i.classification != ObjectClass.GROUND) | is_raised(cloud.xyz, ground, p.changes.raised_m)
         return Surface(cloud.xyz, s.features.normals, g.height, cloud.n_raw, own, is_surface)
 
     surfaces = at_once(surface, clouds, ground, segments, instances, objects.owner)
@@ -299,6 +299,17 @@ def label_objects(
     with_bodies = at_once(lambda side: filled(side, is_building[side.owner], step_m), surfaces)
     of_others = decide(with_bodies.map(lambda side: side.only(~is_building[side.owner])), p.changes)
     return of_buildings.together(of_others, clouds.map(lambda cloud: cloud.xyz))
+
+
+def is_raised(xyz: FloatArray, ground: Pair[Ground], raised_m: float) -> BoolArray:
+    """Which points (m, 3) lie so much above the lower of both ground models that they show a thing, whatever their class.
+
+    A hedge or a skip that one survey met with few returns is ground there, and its model climbs over it.
+    """
+    if raised_m <= 0:
+        return np.zeros(len(xyz), dtype=np.bool_)
+    heights = ground.map(lambda side: side.model.height_at(xyz[:, :2]))
+    return np.asarray(xyz[:, 2] - np.fmin(heights.before, heights.after) > raised_m)
 
 
 def compare_ground(clouds: Pair[VoxelCloud], instances: Pair[Instances], lod: LodGrid, p: Parameters) -> GroundChanges:
