@@ -302,7 +302,7 @@ def label_objects(
 
 
 def is_raised(xyz: FloatArray, ground: Pair[Ground], raised_m: float) -> BoolArray:
-    """Which points (m, 3) lie so much above the lower of both ground models that they show a thing, whatever their class.
+    """Which points (m, 3) lie so far above the lower of both ground models that they show a thing, whatever class.
 
     A hedge or a skip that one survey met with few returns is ground there, and its model climbs over it.
     """

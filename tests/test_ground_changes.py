@@ -53,8 +53,8 @@ def test_fill_of_40_m2_is_found_with_its_figures(dz: float) -> None:
     assert codes.dtype == np.uint8
 
 
-def test_fill_of_20_m2_is_too_small() -> None:
-    found = _changes(Pair(_ground(1), _raised(_ground(2), (10.0, 10.0), (14.0, 15.0), 0.3)))
+def test_fill_of_9_m2_is_too_small() -> None:
+    found = _changes(Pair(_ground(1), _raised(_ground(2), (10.0, 10.0), (13.0, 13.0), 0.3)))
     assert found.regions == []
     assert set(found.label) == {ChangeLabel.UNCHANGED}
 

@@ -148,6 +148,8 @@ def _with_annexes(
     do the two touch.
     """
     n = len(object_class)
+    if n == 0:
+        return label, object_class
     groups = Groups(label, n)
     cell_m = params.building_gap_m / 2
     area = count_cells(xyz[:, :2], label, n, cell_m) * cell_m**2
