@@ -7,7 +7,7 @@ help:  ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-6s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: venv  ## simulate two surveys, detect the changes, score them against the known truth
-	@$(BIN)/loda-pdal bench simulate --seed 7 --overwrite demo/input
+	@$(BIN)/loda-pdal bench simulate --seed 7 --plain --overwrite demo/input
 	@$(BIN)/loda-pdal detect demo/input/before.laz demo/input/after.laz -o demo/result --overwrite
 	@$(BIN)/loda-pdal bench score demo/result demo/input/truth.json
 	@printf '\nlayers for QGIS: demo/result/changes.gpkg\npoint cloud:     demo/result/changes.laz\nreport:          demo/result/report.html\n'

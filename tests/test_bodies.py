@@ -1,0 +1,201 @@
+"""Buildings from the air: bodies in rows, annexes, thin edges, and plants that grew together."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from loda_pdal.model.cloud import FloatArray, IntArray
+from loda_pdal.model.labels import ChangeLabel, ObjectClass
+from loda_pdal.model.lod_grid import LodGrid
+from loda_pdal.model.pair import Pair
+from loda_pdal.params import ChangeParams, ConfidenceParams, ObservabilityParams, Parameters
+from loda_pdal.stages.changes import Changes, decide_changes
+from loda_pdal.stages.cues import Surface, cells_with_owners, sample_voxels
+from loda_pdal.stages.filling import fill_columns, filled_everywhere
+from loda_pdal.stages.instances import split_at_steps
+from loda_pdal.stages.observability import coverage
+from loda_pdal.stages.parts import largest_regions, width_of
+
+AERIAL = Parameters.preset("aerial")
+
+
+def roof(x: tuple[float, float], y: tuple[float, float], z: float, step: float = 0.45) -> FloatArray:
+    """Points (k, 3) m of a flat roof."""
+    grid = np.meshgrid(np.arange(x[0], x[1], step) + 0.1, np.arange(y[0], y[1], step) + 0.1)
+    return np.column_stack([grid[0].ravel(), grid[1].ravel(), np.full(grid[0].size, z)])
+
+
+def surface(parts: list[tuple[int, FloatArray]], bare: FloatArray | None = None) -> Surface:
+    """One epoch: numbered roofs over level ground at z = 0."""
+    xyz = np.concatenate([points for _, points in parts])
+    owner = np.concatenate([np.full(len(points), number, np.int32) for number, points in parts])
+    if bare is not None:
+        xyz, owner = np.concatenate([xyz, bare]), np.append(owner, np.full(len(bare), -1, np.int32))
+    normals = np.tile(np.array([0, 0, 1], np.float32), (len(xyz), 1))
+    is_surface = xyz[:, 2] > 0.3
+    return Surface(xyz, normals, xyz[:, 2].copy(), np.full(len(xyz), 4, np.int32), owner.astype(np.int32), is_surface)
+
+
+GROUND = roof((-10, 50), (-10, 30), 0.0, 0.7)
+
+
+def decide(before: list[tuple[int, FloatArray]], after: list[tuple[int, FloatArray]], *classes: ObjectClass) -> Changes:
+    """Labels of bodies, as the pipeline asks for them."""
+    params = AERIAL.changes.for_bodies()
+    pair = Pair(surface(before, GROUND), surface(after, GROUND)).map(
+        lambda side: filled_everywhere(side, params.voxel_m)
+    )
+    cells = np.unique(np.floor(np.concatenate([side.xyz for side in pair])).astype(np.int32), axis=0)
+    n = len(cells)
+    lod = LodGrid(
+        cells, 1.0, np.full(n, 0.05, np.float32), np.zeros((n, 3), np.float32), np.full(n, 50, np.int32),
+        np.full(n, 50, np.int32), np.ones(n, np.bool_), np.zeros(n, np.float32), 0.5,
+    )  # fmt: skip
+    seen = Pair(coverage(GROUND, AERIAL.observability), coverage(GROUND, AERIAL.observability))
+    codes = np.array(classes, dtype=np.uint8)
+    return decide_changes(pair, codes, seen, lod, params, ObservabilityParams(), ConfidenceParams())
+
+
+def labels_at(changes: Changes, side: list[tuple[int, FloatArray]], owner: IntArray) -> list[set[str]]:
+    """Labels of the points of each part of one epoch."""
+    found, start = [], 0
+    for _, points in side:
+        own = owner[start : start + len(points)]
+        found.append({ChangeLabel(int(changes.label[o])).name for o in own if o >= 0})
+        start += len(points)
+    return found
+
+
+def test_a_storey_on_one_house_of_a_row_is_a_part_of_it() -> None:
+    row = roof((0, 24), (0, 9), 6.0)
+    raised = row.copy()
+    raised[(row[:, 0] > 8) & (row[:, 0] < 14), 2] += 1.4
+    changes = decide([(0, row)], [(0, raised)], ObjectClass.BUILDING)
+    assert [ChangeLabel(c).name for c in sorted(changes.label)] == ["UNCHANGED", "INCREASED"]
+    part = int(np.argmax(changes.parent))
+    is_part = changes.owner.after[: len(row)] == part
+    assert raised[is_part, 0].min() == pytest.approx(8.0, abs=1.2)
+    assert raised[is_part, 0].max() == pytest.approx(14.0, abs=1.2)
+    assert changes.parent[part] == 1 - part
+
+
+def test_an_annex_of_a_house_that_stands_alone_makes_it_grow() -> None:
+    house, annex = roof((0, 10), (0, 9), 6.0), roof((10, 13.5), (2, 7), 2.7)
+    changes = decide([(0, house)], [(0, np.concatenate([house, annex]))], ObjectClass.BUILDING)
+    assert [ChangeLabel(c) for c in changes.label] == [ChangeLabel.INCREASED]
+    assert "in one piece" in changes.reason[0] or "volume up" in changes.reason[0]
+    swapped = decide([(0, np.concatenate([house, annex]))], [(0, house)], ObjectClass.BUILDING)
+    assert [ChangeLabel(c) for c in swapped.label] == [ChangeLabel.DECREASED]
+
+
+def test_an_edge_that_was_sampled_once_is_no_change() -> None:
+    house, edge = roof((0, 10), (0, 9), 6.0), roof((10, 10.8), (0, 9), 6.0)
+    changes = decide([(0, house)], [(0, np.concatenate([house, edge]))], ObjectClass.BUILDING)
+    assert [ChangeLabel(c) for c in changes.label] == [ChangeLabel.UNCHANGED]
+
+
+def test_a_house_that_one_survey_shows_as_fragments_has_not_gone() -> None:
+    house, beside = roof((0, 10), (0, 9), 6.0), roof((10, 20), (0, 9), 6.0)
+    changes = decide([(0, house), (0, beside)], [(0, house), (-1, beside)], ObjectClass.BUILDING)
+    assert {ChangeLabel(c) for c in changes.label} == {ChangeLabel.UNCHANGED}
+
+
+def test_gaps_between_returns_are_filled_as_high_as_the_lower_side() -> None:
+    xyz = np.array([[0.25, 0.25, 6.0], [1.25, 0.25, 4.0]])
+    found = fill_columns(xyz, xyz[:, 2], np.zeros(2, np.int32), np.ones(2, bool), 0.5)
+    in_gap = found.xyz[found.xyz[:, 0] == 0.75]
+    assert in_gap[:, 2].max() == 4.0
+    assert len(in_gap) == 9  # from 4 m down to the ground, in steps of 0.5 m, the top one included
+    assert (found.under[found.xyz[:, 0] == 0.75] == 1).all()
+
+
+@pytest.mark.parametrize(("gap", "n"), [(0.0, 1), (0.4, 1), (2.5, 2)])
+def test_rows_are_cut_where_the_roof_steps(gap: float, n: int) -> None:
+    row = np.concatenate([roof((0, 8), (0, 10), 6.0), roof((8, 16), (0, 10), 6.0 + gap)])
+    label = split_at_steps(row, np.zeros(len(row), np.int32), 0.6, 1.0, 70)
+    assert len(np.unique(label)) == n
+    mixed = np.random.default_rng(0).permutation(len(row))
+    again = split_at_steps(row[mixed], np.zeros(len(row), np.int32), 0.6, 1.0, 70)
+    assert len(np.unique(np.column_stack([label[mixed], again]), axis=0)) == n
+
+
+def test_a_dormer_joins_the_roof_around_it() -> None:
+    house = np.concatenate([roof((0, 12), (0, 10), 6.0), roof((4, 7), (4, 6), 8.0)])
+    assert len(np.unique(split_at_steps(house, np.zeros(len(house), np.int32), 0.6, 1.0, 70))) == 1
+
+
+@pytest.mark.parametrize(("cells", "width"), [((1, 9), 1.0), ((2, 9), 1.0), ((3, 9), 3.0), ((5, 5), 5.0)])
+def test_width_of_columns(cells: tuple[int, int], width: float) -> None:
+    assert width_of(np.argwhere(np.ones(cells))) == width
+
+
+def test_width_does_not_depend_on_the_direction() -> None:
+    along, across = np.meshgrid(np.arange(0, 12, 0.2), np.arange(0, 4, 0.2))
+    turned = np.column_stack([(along - across).ravel(), (along + across).ravel()]) / np.sqrt(2)
+    assert width_of(np.unique(np.floor(turned).astype(np.int64), axis=0)) == pytest.approx(4.0, abs=1.0)
+
+
+def crown(x: float, y: float, seed: int, n: int = 200, radius: float = 2.2) -> FloatArray:
+    random = np.random.default_rng(seed)
+    ball = random.normal(size=(n, 3))
+    ball *= radius * np.cbrt(random.random((n, 1))) / np.linalg.norm(ball, axis=1, keepdims=True)
+    return ball + np.array([x, y, 6.0])
+
+
+def vegetation(before: list[FloatArray], after: list[FloatArray], params: ChangeParams) -> Changes:
+    pair = Pair(
+        surface([(0, np.concatenate(before))], GROUND),
+        surface([(0, np.concatenate(after))], GROUND),
+    )
+    cells = np.unique(np.floor(np.concatenate([side.xyz for side in pair])).astype(np.int32), axis=0)
+    n = len(cells)
+    lod = LodGrid(
+        cells, 1.0, np.full(n, 0.05, np.float32), np.zeros((n, 3), np.float32), np.full(n, 50, np.int32),
+        np.full(n, 50, np.int32), np.ones(n, np.bool_), np.zeros(n, np.float32), 0.5,
+    )  # fmt: skip
+    seen = Pair(coverage(GROUND, AERIAL.observability), coverage(GROUND, AERIAL.observability))
+    codes = np.array([ObjectClass.VEGETATION], dtype=np.uint8)
+    return decide_changes(pair, codes, seen, lod, params, ObservabilityParams(), ConfidenceParams())
+
+
+def test_a_tree_felled_beside_its_neighbour_is_removed_and_the_neighbour_stays() -> None:
+    left, right = crown(5, 5, 1), crown(10, 5, 2)
+    changes = vegetation([left, right], [crown(5, 5, 3)], AERIAL.changes)
+    by_tree = labels_at(changes, [(0, left), (0, right)], changes.owner.before)
+    assert "REMOVED" in by_tree[1]
+    assert by_tree[0] == {"UNCHANGED"} or by_tree[0] == {"UNCHANGED", "REMOVED"}
+    is_removed = changes.label[changes.owner.before[: len(left) + len(right)]] == ChangeLabel.REMOVED
+    assert is_removed[len(left) :].mean() > 0.7
+    assert is_removed[: len(left)].mean() < 0.1
+
+
+def test_a_crown_sampled_twice_as_densely_has_not_grown() -> None:
+    changes = vegetation([crown(5, 5, 1, 80)], [crown(5, 5, 2, 240)], AERIAL.changes)
+    assert [ChangeLabel(c) for c in changes.label] == [ChangeLabel.UNCHANGED]
+
+
+def test_voxels_count_by_the_odds_of_being_met() -> None:
+    pair = Pair(surface([(0, crown(5, 5, 1, 60))]), surface([(0, crown(5, 5, 2, 240))]))
+    lod = LodGrid(
+        np.zeros((0, 3), np.int32), 1.0, np.zeros(0, np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.int32),
+        np.zeros(0, np.int32), np.zeros(0, np.bool_), np.zeros(0, np.float32), 0.5,
+    )  # fmt: skip
+    voxels = sample_voxels(pair, None, lod, AERIAL.changes)
+    cells = cells_with_owners(voxels, pair, 1, AERIAL.changes)
+    mine = cells.owner.after >= 0
+    assert 0.0 < cells.odds.before[mine].min() < cells.odds.before[mine].max() <= 1.0
+    held = cells.owner.before >= 0
+    assert cells.odds.after[held].mean() > cells.odds.before[mine].mean()  # the denser survey misses less
+
+
+def test_regions_are_measured_for_bodies_only() -> None:
+    house = roof((0, 10), (0, 9), 6.0)
+    pair = Pair(surface([(0, house)]), surface([(0, house)]))
+    lod = LodGrid(
+        np.zeros((0, 3), np.int32), 1.0, np.zeros(0, np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.int32),
+        np.zeros(0, np.int32), np.zeros(0, np.bool_), np.zeros(0, np.float32), 0.5,
+    )  # fmt: skip
+    street = Parameters().changes
+    cells = cells_with_owners(sample_voxels(pair, None, lod, street), pair, 1, street)
+    assert [side.tolist() for side in largest_regions(cells, 1, street)] == [[0.0], [0.0]]
