@@ -613,13 +613,13 @@ class ConfidenceParams(StageParams):
     weight_shift: float = param(0.10, "weight of the centroid shift", low=0, high=1)
     weight_displacement: float = param(0.15, "weight of the normal displacement", low=0, high=1)
     calibration_unmatched: tuple[float, ...] = param(
-        (-3.32, 5.9), "logistic offset and slope of Added and Removed", low=-50, high=50
+        (-0.2, 2.65), "logistic offset and slope of Added and Removed", low=-50, high=50
     )
     calibration_changed: tuple[float, ...] = param(
-        (-2.29, 4.66), "logistic offset and slope of Increased and Decreased", low=-50, high=50
+        (-0.57, 1.79), "logistic offset and slope of Increased and Decreased", low=-50, high=50
     )
     calibration_unchanged: tuple[float, ...] = param(
-        (-1.02, 5.61), "logistic offset and slope of Unchanged", low=-50, high=50
+        (-2.56, 4.69), "logistic offset and slope of Unchanged", low=-50, high=50
     )
 
 
@@ -872,6 +872,11 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "frontage_m": 0.0,
         },
         "observability": {"cell_m": 2.0},
+        "confidence": {
+            "calibration_unmatched": (-2.49, 5.01),
+            "calibration_changed": (-1.26, 2.7),
+            "calibration_unchanged": (-2.55, 5.88),
+        },
     },
     "paper": {
         "name": "paper",
