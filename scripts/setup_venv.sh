@@ -28,5 +28,5 @@ if [ ! -x .venv/bin/python ]; then
   "$python" -m venv .venv
 fi
 echo "Installing loda-pdal and its development tools into .venv"
-.venv/bin/python -m pip install --quiet --editable '.[dev]'
+.venv/bin/python -m pip install --quiet --editable '.[dev,bench]'
 echo "$wanted" > $stamp
