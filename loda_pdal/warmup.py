@@ -6,9 +6,12 @@ written. What gets compiled on the way is kept in the cache folder of `loda_pdal
 
 from __future__ import annotations
 
+import gc
 import logging
 import pkgutil
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -61,13 +64,25 @@ def compile_kernels(folder: Path, progress: Progress | None = None) -> Compiled:
         ``progress(done, total, text)``, called whenever a kernel has been compiled.
     """
     start = time.perf_counter()
-    with event.install_listener("numba:compile", _Count(progress)) as count:
+    with _uncollected(), event.install_listener("numba:compile", _Count(progress)) as count:
         surveys = read_epochs(*write_scene(folder), trajectories=write_trajectories(folder))
         for preset in PRESETS:
             result = detect_changes(surveys.before, surveys.after, Parameters.preset(preset))
         write_outputs(result, surveys, folder / "result", overwrite=True)
     mark_cache_warm()
     return Compiled(len(count.compiled), time.perf_counter() - start)
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """No search for garbage meanwhile: a compiler makes millions of small objects that all stay."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
 
 
 def kernels() -> list[Any]:
