@@ -36,7 +36,7 @@ logger = logging.getLogger(__name__)
 COMPILING = "compiling kernels, once"
 """What progress says meanwhile."""
 
-NOTICE = "Compiling kernels, once: that takes about a minute."
+NOTICE = "Compiling kernels, once: that takes about half a minute."
 """What is said before."""
 
 EPSG, PLACE = 28992, np.array([121_000.0, 487_000.0, 0.0])
