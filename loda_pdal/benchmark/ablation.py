@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from loda_pdal.benchmark.evaluate import (
-    METHOD_SOURCES,
     N_RESAMPLES,
     KnownBlock,
     Say,
@@ -25,7 +24,8 @@ from loda_pdal.benchmark.evaluate import (
     prepared_blocks,
     read_block,
     read_stamp,
-    sources_digest,
+    version_of,
+    write_stamp,
 )
 from loda_pdal.benchmark.metrics import LABELS, Scores, markdown_table
 from loda_pdal.benchmark.protocols import ScoreReport, judge
@@ -313,7 +313,7 @@ def _row(variant: Variant, parameters: Parameters) -> Row:
 def _outcomes(block_dir: Path, chosen: list[Parameters], say: Say) -> Iterable[Outcome]:
     """Outcome of each parameters on a block, known ones from the file beside it."""
     path = block_dir / "ablation.json"
-    version = hashlib.sha256((block_dir / "block.json").read_bytes()).hexdigest() + sources_digest(*METHOD_SOURCES)
+    version = version_of(block_dir)
     known = read_stamp(path) or {}
     if known.get("version") != version:
         known = {"version": version, "outcomes": {}}
@@ -336,9 +336,7 @@ def _outcomes(block_dir: Path, chosen: list[Parameters], say: Say) -> Iterable[O
             )
             say(f"  {described(parameters)}: mIoU {100 * _miou(outcome.confusion):.1f}")
             known["outcomes"][key] = outcome.to_dict()
-            part = path.with_suffix(".part")
-            part.write_text(json.dumps(known), encoding="utf-8")
-            part.replace(path)
+            write_stamp(path, known)
         yield Outcome.from_dict(known["outcomes"][key])
 
 

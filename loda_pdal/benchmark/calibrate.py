@@ -8,7 +8,6 @@ as a logistic function of the raw score, for three kinds of labels; validation b
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,19 +19,19 @@ import numpy.typing as npt
 from scipy.optimize import minimize
 
 from loda_pdal.benchmark.evaluate import (
-    METHOD_SOURCES,
     Say,
     described,
+    naming,
     prepared_blocks,
     read_block,
     read_stamp,
-    sources_digest,
+    version_of,
+    write_stamp,
 )
 from loda_pdal.benchmark.metrics import markdown_table
 from loda_pdal.benchmark.runs import JudgedPoints, judged_result
 from loda_pdal.benchmark.truth import Truth
 from loda_pdal.model.cloud import BoolArray, FloatArray
-from loda_pdal.model.errors import InputError, LodaError
 from loda_pdal.model.labels import ChangeLabel
 from loda_pdal.model.records import ObjectRecord
 from loda_pdal.params import Parameters
@@ -307,19 +306,14 @@ def _votes(objects: npt.NDArray[Any], labels: npt.NDArray[Any], n_objects: int) 
 def _judged_block(block_dir: Path, parameters: Parameters, name: str, say: Say) -> list[Judged]:
     """The judged objects of a block, from the file beside it where it is of the same method and parameters."""
     path = block_dir / "calibration.json"
-    about = json.dumps(parameters.to_dict(), sort_keys=True).encode() + (block_dir / "block.json").read_bytes()
-    version = hashlib.sha256(about).hexdigest() + sources_digest(*METHOD_SOURCES)
+    version = json.dumps(parameters.to_dict(), sort_keys=True) + version_of(block_dir)
     known = read_stamp(path) or {}
     if known.get("version") != version:
         say(f"{name}: running")
         block = read_block(block_dir)
-        try:
+        with naming(name):
             result = detect_changes(block.surveys.before, block.surveys.after, parameters)
-        except LodaError as error:
-            raise InputError(f"{name}: {error.message}", error.remedy, error.code) from error
         points = judged_result(result, block.annotation, block.truth.T_after_before)
         known = {"version": version, "objects": judged_objects(points, block.truth, result.objects)}
-        part = path.with_suffix(".part")
-        part.write_text(json.dumps(known), encoding="utf-8")
-        part.replace(path)
+        write_stamp(path, known)
     return [Judged(*row) for row in known["objects"]]

@@ -292,8 +292,7 @@ def sheet(run_dir: Path, truth_json: Path | None, out: Path, largest: int, per_p
     help="Parameters of our own method, and of the baselines tuned for such surveys.",
 )
 @click.option("--tune", "is_tuning", is_flag=True, help="Search the baselines' parameters on these blocks instead.")
-@click.option("--json", "as_json", is_flag=True, help="Write everything as JSON.")
-@click.option("--markdown", type=click.Path(path_type=Path, dir_okay=False), help="Write the table to this file too.")
+@_written
 def baselines(
     folders: tuple[Path, ...],
     training: tuple[Path, ...],
@@ -313,17 +312,13 @@ def baselines(
         for name, found in tune(folders, training=training, preset=preset, say=_say).items():
             click.echo(f"{name}: {found.params}, mIoU {100 * found.macro_iou:.1f}")
         return
-    comparison = run_baselines(folders, training=training, preset=preset, say=_say)
-    if markdown is not None:
-        markdown.write_text(comparison.to_markdown() + "\n", encoding="utf-8")
-    click.echo(json.dumps(comparison.to_dict()) if as_json else comparison.to_markdown())
+    _show(run_baselines(folders, training=training, preset=preset, say=_say), as_json, markdown)
 
 
 @bench.command()
 @click.argument("folders", metavar="SCENE_DIR...", nargs=-1, required=True, type=_FOLDER)
 @click.option("--preset", type=click.Choice(("street", "aerial")), default="aerial", show_default=True)
-@click.option("--json", "as_json", is_flag=True, help="Write everything as JSON.")
-@click.option("--markdown", type=click.Path(path_type=Path, dir_okay=False), help="Write the table to this file too.")
+@_written
 def urb3dcd(folders: tuple[Path, ...], preset: str, as_json: bool, markdown: Path | None) -> None:
     """Point-wise scores on Urb3DCD scenes: folders with pointCloud0.ply and pointCloud1.ply."""
     from loda_pdal.benchmark.urb3dcd import run_scenes, to_markdown

@@ -15,6 +15,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import cache
 from itertools import islice
@@ -252,7 +253,7 @@ def _ensure_result(
     """Run the method on a block unless its result is there; seconds that it took."""
     stamp_path = block_dir / f"{result}.json"
     stamp = {
-        "block": hashlib.sha256((block_dir / "block.json").read_bytes()).hexdigest(),
+        "block": _file_digest(block_dir / "block.json"),
         "parameters": json.loads(json.dumps(parameters.to_dict())),
         "method": sources_digest(*METHOD_SOURCES),
         "with_trajectories": with_trajectories,
@@ -262,18 +263,16 @@ def _ensure_result(
     say(f"{name}: running")
     stamp_path.unlink(missing_ok=True)
     start = time.perf_counter()
-    try:
-        before, after = block_dir / "before.laz", block_dir / "after.laz"
-        ways: Pair[Path | None] = Pair(None, None)
-        if with_trajectories:
-            ways = Pair(block_dir / "before_trajectory.csv", block_dir / "after_trajectory.csv")
+    before, after = block_dir / "before.laz", block_dir / "after.laz"
+    ways: Pair[Path | None] = Pair(None, None)
+    if with_trajectories:
+        ways = Pair(block_dir / "before_trajectory.csv", block_dir / "after_trajectory.csv")
+    with naming(name):
         surveys = read_epochs(before, after, trajectories=ways)
         found = detect_changes(surveys.before, surveys.after, parameters)
-    except LodaError as error:
-        raise InputError(f"{name}: {error.message}", error.remedy, error.code) from error
     seconds = time.perf_counter() - start
     write_outputs(found, surveys, block_dir / result, overwrite=True, run_info={"preset": parameters.name})
-    stamp_path.write_text(json.dumps(stamp, indent=1) + "\n", encoding="utf-8")
+    write_stamp(stamp_path, stamp)
     return seconds
 
 
@@ -289,9 +288,22 @@ def sources_digest(*parts: str) -> str:
     return digest.hexdigest()
 
 
-@cache
 def _file_digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def version_of(block_dir: Path) -> str:
+    """What a block and the method are: what was found with others is found anew."""
+    return _file_digest(block_dir / "block.json") + sources_digest(*METHOD_SOURCES)
+
+
+@contextmanager
+def naming(what: str) -> Iterator[None]:
+    """Errors of the method say on ``what`` it was run."""
+    try:
+        yield
+    except LodaError as error:
+        raise InputError(f"{what}: {error.message}", error.remedy, error.code) from error
 
 
 def _plain_options(block: SuiteBlock) -> dict[str, Any]:
@@ -309,6 +321,13 @@ def read_stamp(path: Path) -> dict[str, Any] | None:
     except (OSError, ValueError):
         return None
     return found if isinstance(found, dict) else None
+
+
+def write_stamp(path: Path, known: dict[str, Any]) -> None:
+    """Write a JSON object to a file, all of it or nothing."""
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+    part.replace(path)
 
 
 def described(parameters: Parameters) -> str:

@@ -24,7 +24,7 @@ from loda_pdal.benchmark.baselines.tuned import TUNED
 from loda_pdal.benchmark.metrics import markdown_table
 from loda_pdal.io.ply import read_ply, write_ply
 from loda_pdal.kernels.parallel import thread_count
-from loda_pdal.model.cloud import ORIGIN_STEP, ByteArray, FloatArray, Int64Array
+from loda_pdal.model.cloud import ByteArray, FloatArray, Int64Array
 from loda_pdal.model.errors import InputError, OutputError
 from loda_pdal.model.frame import LocalFrame
 from loda_pdal.model.labels import ChangeLabel, ObjectClass
@@ -310,11 +310,7 @@ def to_markdown(scores: dict[str, UrbScores]) -> str:
 
 def _surveys(scene: UrbScene) -> Pair[Survey]:
     """Both clouds as a reader would give them."""
-    low = np.min([xyz.min(axis=0, initial=np.inf) for xyz in scene.clouds], axis=0)
-    x, y = (
-        (np.floor(low[:2] / ORIGIN_STEP) * ORIGIN_STEP if np.isfinite(low).all() else np.zeros(2)).astype(int).tolist()
-    )
-    frame = LocalFrame((x, y, 0))
+    frame = LocalFrame.about(np.min([xyz.min(axis=0, initial=np.inf) for xyz in scene.clouds], axis=0))
     return scene.clouds.map(lambda xyz: Survey(frame.to_local(xyz), frame, path=scene.name))
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from loda_pdal.io.gps_time import gps_day
 from loda_pdal.io.las_points import LasFile, broken, reading, unreadable
 from loda_pdal.io.memory import check_memory, estimate_memory
 from loda_pdal.io.trajectory import MapTrajectory, TrajectoryCheck, read_trajectory
-from loda_pdal.model.cloud import ORIGIN_STEP, FloatArray
+from loda_pdal.model.cloud import FloatArray
 from loda_pdal.model.errors import InputError
 from loda_pdal.model.extent import Extent
 from loda_pdal.model.frame import LocalFrame
@@ -211,8 +211,8 @@ def read_epochs(
 
 def common_frame(low: Pair[FloatArray], crs: MapCrs) -> LocalFrame:
     """The local frame of two clouds whose lowest full map coordinates are ``low``, (3,) each."""
-    x, y = (int(v) for v in np.floor(np.minimum(low.before, low.after)[:2] / ORIGIN_STEP) * ORIGIN_STEP)
-    return LocalFrame((x, y, 0), crs.unit_xy_m, crs.unit_z_m, crs.wkt)
+    frame = LocalFrame.about(np.minimum(low.before, low.after))
+    return replace(frame, unit_xy_m=crs.unit_xy_m, unit_z_m=crs.unit_z_m, crs_wkt=crs.wkt)
 
 
 def check_coverage(names: Pair[str], extents: Pair[Extent]) -> None:

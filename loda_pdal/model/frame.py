@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loda_pdal.model.cloud import FloatArray, to_local_grid
+from loda_pdal.model.cloud import ORIGIN_STEP, FloatArray, to_local_grid
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,12 @@ class LocalFrame:
     unit_xy_m: float = 1.0
     unit_z_m: float = 1.0
     crs_wkt: str | None = None
+
+    @classmethod
+    def about(cls, low: FloatArray) -> LocalFrame:
+        """The frame of points in metres whose lowest coordinates are ``low`` (3,); about 0 where there are none."""
+        x, y = (np.floor(low[:2] / ORIGIN_STEP) * ORIGIN_STEP).tolist() if np.isfinite(low).all() else (0, 0)
+        return cls((int(x), int(y), 0))
 
     @property
     def scale(self) -> FloatArray:

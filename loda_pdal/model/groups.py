@@ -178,3 +178,14 @@ def unique_inverse(rows: Int64Array) -> Int64Array:
     inverse = np.empty(len(rows), dtype=np.int64)
     inverse[order] = np.cumsum(np.diff(keys[order], prepend=keys[order[0]]) > 0)
     return inverse
+
+
+def favourites(own: npt.NDArray[Any], other: npt.NDArray[Any]) -> tuple[Int64Array, Int64Array, Int64Array]:
+    """For each value (f,) in ``own`` (k,), ascending, the value (f,) in ``other`` (k,) that most often goes with it (of
+    equals the lowest), and how often (f,). Values are not negative."""
+    n = int(other.max(initial=0)) + 1
+    key, count = np.unique(own.astype(np.int64) * n + other, return_counts=True)
+    first, second = np.divmod(key, n)
+    order = np.lexsort((second, -count, first))
+    best = order[np.diff(first[order], prepend=-1) != 0]
+    return first[best], second[best], count[best].astype(np.int64)

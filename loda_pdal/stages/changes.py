@@ -157,7 +157,7 @@ def _divided(surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, p
     cast = Cast(surfaces, object_class, np.full(n, -1, dtype=np.int32), no, no, no).settled(voxels)
     cells = cast.cells(voxels, params)
     evidence = weigh(cells, cast.surfaces, len(cast), params)
-    cues = cues_of(evidence, cast.object_class, largest_regions(cells, len(cast), params))
+    cues = cues_of(evidence, cast.object_class)
     is_inner = np.array([is_within(cue, params) for cue in cues], dtype=np.bool_)
     is_apart = np.array([is_no_pair(cue, params) for cue in cues], dtype=np.bool_) & ~is_inner
     is_apart |= _is_replaced(cast, cues, voxels.at_points(cells.is_seen.swapped, cast.surfaces), params)

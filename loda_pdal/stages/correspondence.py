@@ -18,7 +18,7 @@ import numpy as np
 from loda_pdal.kernels.clusters import components
 from loda_pdal.kernels.neighbours import nearest
 from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, IntArray
-from loda_pdal.model.groups import Groups
+from loda_pdal.model.groups import Groups, favourites
 from loda_pdal.model.labels import OBJECT_CLASSES, ObjectClass
 from loda_pdal.model.pair import Pair
 from loda_pdal.params import AssociationParams
@@ -86,8 +86,8 @@ def match_instances(
         pairs = np.concatenate([pairs, _pairs_by_proxy(instances, *proxy_pairs, pairs)])
     n_before, n_after = len(instances.before), len(instances.after)
     votes = Pair(
-        _shared_space(*bodies.before, n_before, *bodies.after, n_after, reach_m),
-        _shared_space(*bodies.after, n_after, *bodies.before, n_before, reach_m),
+        _shared_space(*bodies.before, n_before, *bodies.after, reach_m),
+        _shared_space(*bodies.after, n_after, *bodies.before, reach_m),
     )
     left = Pair(_left_over(votes.before, pairs[:, 0]), _left_over(votes.after, pairs[:, 1]))
     is_apart = left.map(lambda side: np.zeros(len(side), np.bool_))
@@ -166,9 +166,9 @@ def _largest_by_proxy_and_class(instances: Instances, proxy: IntArray) -> dict[t
 
 
 def _shared_space(
-    xyz: FloatArray, instance: IntArray, n: int, other_xyz: FloatArray, other: IntArray, n_others: int, reach_m: float
+    xyz: FloatArray, instance: IntArray, n: int, other_xyz: FloatArray, other: IntArray, reach_m: float
 ) -> _Votes:
-    """Votes of the points of instances 1 to ``n`` for those of the other epoch, 1 to ``n_others``."""
+    """Votes of the points of instances 1 to ``n`` for those of the other epoch."""
     support, partner, nearest_of = np.zeros(n), np.full(n, -1, np.int32), np.full(len(xyz), -1, np.int32)
     if len(xyz) == 0 or len(other_xyz) == 0:
         return _Votes(support, partner, nearest_of)
@@ -178,13 +178,8 @@ def _shared_space(
     is_near = found >= 0
     support = np.bincount(own[is_near], minlength=n) / points
     nearest_of[is_near] = theirs = other[found[is_near]] - 1
-    key, votes = np.unique(own[is_near].astype(np.int64) * n_others + theirs, return_counts=True)
-    own_of, theirs_of = np.divmod(key, n_others)
-    order = np.lexsort((theirs_of, -votes, own_of))
-    is_first = np.ones(len(order), np.bool_)
-    is_first[1:] = own_of[order][1:] != own_of[order][:-1]
-    best = order[is_first]
-    partner[own_of[best]] = theirs_of[best]
+    voter, favourite, _ = favourites(own[is_near], theirs)
+    partner[voter] = favourite
     return _Votes(support, partner, nearest_of)
 
 

@@ -86,7 +86,8 @@ class Voxels:
     is_covered : Pair of (c,) bool
         Whether that epoch saw the voxel, or its column where no ray says more.
     is_over : Pair of (c,) bool
-        Whether that epoch has a return in the voxel's column beneath the voxel: its rays went in there.
+        Whether that epoch has a return in the voxel's column beneath the voxel: its rays went in there. True where no
+        rule asks.
     is_hidden : Pair of (c,) bool
         Whether the voxel was hidden from that epoch behind something nearer to its sensor.
     normal : (c, 3) float64
@@ -304,6 +305,9 @@ def sample_voxels(
     always, never = np.ones(len(cell), np.bool_), np.zeros(len(cell), np.bool_)
     covered, hidden = Pair(always, always), Pair(never, never)
     is_open = xyz.map(lambda points: np.ones(len(points), np.bool_))
+    over = Pair(always, always)
+    if params.needs_sight or params.thing_voxels > 0:
+        over = surfaces.map(lambda surface: _is_over(centre, cell, columns, surface.xyz, params.voxel_m))
     if coverage:
         shown = coverage.map(lambda side: side.shown(cell, params.voxel_m))
         hidden = shown.map(lambda rays: rays.is_hidden)
@@ -318,7 +322,7 @@ def sample_voxels(
         is_open=np.concatenate(list(is_open))[order],
         is_near=found.map(lambda idx: idx >= 0),
         is_covered=covered,
-        is_over=surfaces.map(lambda surface: _is_over(centre, cell, columns, surface.xyz, params.voxel_m)),
+        is_over=over,
         is_hidden=hidden,
         normal=normal,
         displacement=displacement,
@@ -337,12 +341,15 @@ def cells_with_owners(
     holder, points = voxels.holders(surfaces, n)
     owner, n_raw = (Pair(*np.ascontiguousarray(values.T)) for values in (holder, points))
     is_seen = voxels.is_covered
-    expected = _expected_points(owner, n_raw, n)
-    if params.min_expected_points > 0:
-        is_seen = is_seen.join(expected, lambda seen, points: seen & (points >= params.min_expected_points))
-    odds = expected.map(lambda points: 1.0 - np.exp(-points) if params.weighs_sampling else np.ones(len(points)))
+    odds = n_raw.map(np.ones_like)
+    if params.min_expected_points > 0 or params.weighs_sampling:
+        expected = _expected_points(owner, n_raw, n)
+        if params.min_expected_points > 0:
+            is_seen = is_seen.join(expected, lambda seen, points: seen & (points >= params.min_expected_points))
+        if params.weighs_sampling:
+            odds = expected.map(lambda points: 1.0 - np.exp(-points))
     if is_solid is not None and is_solid.any():
-        own = Pair(owner.after, owner.before)  # what each epoch should have seen is the other's
+        own = owner.swapped  # what each epoch should have seen is the other's
         is_hidden = Pair(
             ~voxels.is_over.before | _is_beneath(voxels, own.before, owner.before),
             ~voxels.is_over.after | _is_beneath(voxels, own.after, owner.after),
@@ -473,7 +480,7 @@ def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -
         d_typical=np.where(is_sampled, samples.median(np.abs(displacement)), np.nan),
         gained_above=_count(own.after, cells.is_gained & _is_above(z, own.after, summit.before), n, cells.odds.before),
         lost_above=_count(own.before, cells.is_lost & _is_above(z, own.before, summit.after), n, cells.odds.after),
-        column_rise=_column_rise(voxels, surfaces, n, is_fair=params.fair_tops),
+        column_rise=_median_rise(_fair_rises(voxels, surfaces, n) if params.fair_tops else columns.rises, n),
         lod95=Groups(owner, n).median(voxels.lod95[voxel]),
         observability=(n_known.before + n_known.after) / np.maximum(n_voxels.before + n_voxels.after, 1),
         hidden=(n_hidden.before + n_hidden.after) / np.maximum(n_voxels.before + n_voxels.after, 1),
@@ -538,6 +545,13 @@ class _Columns(NamedTuple):
     owner: IntArray
     top: Pair[FloatArray]
 
+    @property
+    def rises(self) -> tuple[IntArray, FloatArray]:
+        """Columns that both epochs have: the object of each, and how far its top rises, m."""
+        rise = self.top.after - self.top.before
+        is_both = np.isfinite(rise)
+        return self.owner[is_both], rise[is_both]
+
 
 def _column_tops(voxels: Voxels, surfaces: Pair[Surface], n: int) -> _Columns:
     """Highest point in each column of each object, in the columns that the other epoch saw.
@@ -559,11 +573,20 @@ def _summit(owner: IntArray, top: FloatArray, n: int) -> FloatArray:
     return Groups(owner[is_known], n).quantile(top[is_known], 0.95)
 
 
-def _column_rise(voxels: Voxels, surfaces: Pair[Surface], n: int, *, is_fair: bool) -> FloatArray:
-    """Median change of the columns' tops (n,) m over the columns that both epochs have.
+def _median_rise(rises: tuple[IntArray, FloatArray], n: int) -> FloatArray:
+    """Median change of the columns' tops (n,) m over the columns that both epochs have."""
+    groups = Groups(rises[0], n)
+    return np.where(groups.counts >= _LEAST_COLUMNS, groups.median(rises[1]), np.nan)
 
-    The more points, the higher the highest of them: to be fair, where an epoch has m points of the object in a column
-    and the other k < m, its top is that of k points drawn from the m, which lies at rank (m + 1) / (k + 1) in the mean.
+
+_LEAST_COLUMNS = 8
+
+
+def _fair_rises(voxels: Voxels, surfaces: Pair[Surface], n: int) -> tuple[IntArray, FloatArray]:
+    """Columns that both epochs have: the object (b,) of each, and how far its top rises (b,) m between equals.
+
+    The more points, the higher the highest of them: where an epoch has m points of the object in a column and the other
+    k < m, its top is that of k points drawn from the m, which lies at rank (m + 1) / (k + 1) in the mean.
     """
     owner = voxels.of_points([side.owner for side in surfaces])
     kept = np.flatnonzero((owner >= 0) & voxels.is_open)
@@ -578,16 +601,11 @@ def _column_rise(voxels: Voxels, surfaces: Pair[Surface], n: int, *, is_fair: bo
     before = np.flatnonzero((key[first[:-1]] % 2 == 0) & (key[first[1:]] == key[first[:-1]] + 1))
     tops = []
     for own, other in ((before, before + 1), (before + 1, before)):
-        fewer = np.minimum(count[own], count[other]) if is_fair else count[own]
-        rank = (count[own] + 1) / (fewer + 1) - 1.0
+        rank = (count[own] + 1) / (np.minimum(count[own], count[other]) + 1) - 1.0
         low = np.minimum(rank.astype(np.int64), count[own] - 1)
         high = np.minimum(low + 1, count[own] - 1)
         tops.append(z[first[own] + low] + (rank - low) * (z[first[own] + high] - z[first[own] + low]))
-    groups = Groups(((key[first[before]] // 2) % max(n, 1)).astype(np.int32), n)
-    return np.where(groups.counts >= _LEAST_COLUMNS, groups.median(tops[1] - tops[0]), np.nan)
-
-
-_LEAST_COLUMNS = 8
+    return ((key[first[before]] // 2) % max(n, 1)).astype(np.int32), tops[1] - tops[0]
 
 
 def _is_above(z: FloatArray, owner: IntArray, top: FloatArray) -> BoolArray:

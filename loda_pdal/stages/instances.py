@@ -14,7 +14,7 @@ from loda_pdal.kernels.rasters import highest_range
 from loda_pdal.model.boxes import upright_boxes
 from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, Int64Array, IntArray
 from loda_pdal.model.grid import Lattice
-from loda_pdal.model.groups import Groups, consecutive, count_cells
+from loda_pdal.model.groups import Groups, consecutive, count_cells, favourites
 from loda_pdal.model.labels import ObjectClass
 from loda_pdal.params import InstanceParams, SemanticParams
 from loda_pdal.stages.semantics import Semantics, fit_planes, voxel_volume
@@ -163,14 +163,10 @@ def _with_annexes(
     plan = np.column_stack([xyz[:, :2], np.zeros(len(xyz))])
     found, _ = nearest(plan[house], plan[annex], params.annex_gap_m)
     is_beside = found >= 0
-    pair = label[annex[is_beside]].astype(np.int64) * n + label[house[found[is_beside]]]
-    code, contact = np.unique(pair, return_counts=True)
-    own, host = np.divmod(code, n)
-    order = np.lexsort((host, -contact, own))
-    order = order[np.diff(own[order], prepend=-1) != 0]
-    order = order[contact[order] >= _LEAST_CONTACTS]
+    own, host, contact = favourites(label[annex[is_beside]], label[house[found[is_beside]]])
+    is_enough = contact >= _LEAST_CONTACTS
     goal = np.arange(n, dtype=np.int32)
-    goal[own[order]] = host[order]
+    goal[own[is_enough]] = host[is_enough]
     kept = np.flatnonzero(goal == np.arange(n))
     number = np.full(n + 1, -1, dtype=np.int32)
     number[kept] = np.arange(len(kept), dtype=np.int32)
@@ -219,16 +215,12 @@ def split_at_steps(xyz: FloatArray, label: IntArray, cell_m: float, step_m: floa
     while True:
         n = int(roof.max()) + 1
         size = np.bincount(roof, minlength=n)
-        pair = roof[border]
-        pair = pair[pair[:, 0] != pair[:, 1]].astype(np.int64)
-        code, length = np.unique(np.concatenate([pair, pair[:, ::-1]]) @ np.array([n, 1]), return_counts=True)
-        own, other = np.divmod(code, n)
-        best = np.lexsort((other, -length, own))
-        best = best[np.diff(own[best], prepend=-1) != 0]
-        best = best[size[own[best]] < least_cells]
-        if len(best) == 0:
+        a, b = roof[border[roof[border[:, 0]] != roof[border[:, 1]]]].T
+        own, other, _ = favourites(np.concatenate([a, b]), np.concatenate([b, a]))
+        is_small = size[own] < least_cells
+        if not is_small.any():
             return consecutive(roof[column])[0]
-        roof = components(np.column_stack([own[best], other[best]]), n)[roof]
+        roof = components(np.column_stack([own, other])[is_small], n)[roof]
 
 
 def _held_by_buildings(

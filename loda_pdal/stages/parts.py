@@ -104,17 +104,19 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, 
         is_split |= _are_in_rows(columns_of[0], n)
     is_plant = is_pair & (object_class == ObjectClass.VEGETATION) & (params.plant_width_m > 0)
     is_split &= is_pair & ~is_plant
-    own, bare = cells.owner, cells.bare_columns
+    own = cells.owner
     size = params.part_min_voxels, params.part_min_width_m / params.voxel_m
     plant = 1, params.plant_width_m / params.voxel_m
     regions = [
         *connected_regions(cells, own, cells.is_lost, is_split, *size),
         *connected_regions(cells, own.swapped, cells.is_gained, is_split, *size),
-        *connected_regions(cells, own, bare.after, is_plant, *plant),
-        *connected_regions(cells, own.swapped, bare.before, is_plant, *plant),
         *connected_regions(cells, own, cells.is_near.after, ~is_pair, *size),
         *connected_regions(cells, own.swapped, cells.is_near.before, ~is_pair, *size),
     ]
+    if is_plant.any():
+        bare = cells.bare_columns
+        regions += connected_regions(cells, own, bare.after, is_plant, *plant)
+        regions += connected_regions(cells, own.swapped, bare.before, is_plant, *plant)
     columns, part, parent, is_house, is_extension = _claim(
         regions, columns_of, has_houses & is_pair, is_long, is_plant, params
     )

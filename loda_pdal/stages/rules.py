@@ -53,8 +53,10 @@ class Verdict(NamedTuple):
     reason: str
 
 
-def cues_of(evidence: Evidence, object_class: ByteArray, regions: Pair[FloatArray]) -> list[Cue]:
-    """The evidence object by object; ``regions`` (n,) m3 of the largest piece that each lost and gained."""
+def cues_of(evidence: Evidence, object_class: ByteArray, regions: Pair[FloatArray] | None = None) -> list[Cue]:
+    """The evidence object by object; ``regions`` (n,) m3 of the largest piece that each lost and gained, 0 if left
+    out."""
+    regions = regions or Pair(np.zeros(len(object_class)), np.zeros(len(object_class)))
     columns = (
         evidence.n_voxels.before > 0,
         evidence.n_voxels.after > 0,

@@ -7,12 +7,13 @@ again, half a metre on. So each is moved and turned until it fits, and what then
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from loda_pdal.kernels.neighbours import knn, nearest
 from loda_pdal.model.boxes import upright_boxes
-from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array
+from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array, IntArray
 from loda_pdal.model.groups import Groups, count_cells
 from loda_pdal.model.pair import Pair
 from loda_pdal.stages.cues import Surface
@@ -65,29 +66,9 @@ def shape_change(surfaces: Pair[Surface], is_open: Pair[BoolArray], is_asked: Bo
     if not is_asked.any():
         return np.full(len(is_asked), np.nan)
     lift = np.where(is_asked, np.cumsum(is_asked), -1)
-    members = surfaces.map(lambda side: np.flatnonzero(np.append(is_asked, False)[side.owner]))
-    apart = surfaces.join(members, lambda side, idx: _lifted(side, idx, lift))
-    before = _residual(
-        surfaces.before,
-        members.before,
-        apart.before,
-        is_open.before,
-        surfaces.after,
-        members.after,
-        apart.after,
-        len(is_asked),
-    )
-    after = _residual(
-        surfaces.after,
-        members.after,
-        apart.after,
-        is_open.after,
-        surfaces.before,
-        members.before,
-        apart.before,
-        len(is_asked),
-    )
-    return np.fmin(before, after)
+    sides = surfaces.join(is_open, lambda side, seen: _parked(side, seen, is_asked, lift))
+    n = len(is_asked)
+    return np.fmin(_residual(sides.before, sides.after, n), _residual(sides.after, sides.before, n))
 
 
 def roughness(surfaces: Pair[Surface], is_asked: BoolArray) -> FloatArray:
@@ -124,39 +105,38 @@ def looks_like_vehicle(
     return fits
 
 
-def _lifted(surface: Surface, members: Int64Array, lift: Int64Array) -> FloatArray:
-    """Points (k, 3) m of the members, each object at a height of its own."""
-    xyz = surface.xyz[members].copy()
-    xyz[:, 2] += _APART_M * lift[surface.owner[members]]
-    return xyz
+class _Parked(NamedTuple):
+    """The points (k,) of the vehicles of one epoch, each vehicle at a height of its own."""
+
+    owner: IntArray
+    xyz: FloatArray
+    normals: FloatArray
+    is_open: BoolArray
 
 
-def _residual(
-    surface: Surface,
-    members: Int64Array,
-    xyz: FloatArray,
-    is_open: BoolArray,
-    other: Surface,
-    other_members: Int64Array,
-    other_xyz: FloatArray,
-    n: int,
-) -> FloatArray:
-    """Upper quartile (n,) m of the residuals of one epoch's points (k, 3) on the other's (l, 3)."""
-    owner = surface.owner[members]
-    normals = other.normals[other_members].astype(np.float64)
+def _parked(surface: Surface, is_open: BoolArray, is_asked: BoolArray, lift: Int64Array) -> _Parked:
+    members = np.flatnonzero(np.append(is_asked, False)[surface.owner])
+    owner, xyz = surface.owner[members], surface.xyz[members].copy()
+    xyz[:, 2] += _APART_M * lift[owner]
+    return _Parked(owner, xyz, surface.normals[members].astype(np.float64), is_open[members])
+
+
+def _residual(side: _Parked, other: _Parked, n: int) -> FloatArray:
+    """Upper quartile (n,) m of the residuals of one epoch's points on the other's."""
+    owner, xyz = side.owner, side.xyz
     groups = Groups(owner, n)
     arm = xyz[:, :2] - groups.mean(xyz[:, :2])[owner]
     arm = np.column_stack([-arm[:, 1], arm[:, 0]])  # where a turn takes the points
     move = np.zeros((n, 4))
     for _ in range(_ITERATIONS):
-        move = _moved_on(_at(xyz, arm, move[owner]), arm, other_xyz, normals, groups, move)
+        move = _moved_on(_at(xyz, arm, move[owner]), arm, other.xyz, other.normals, groups, move)
     moved = _at(xyz, arm, move[owner])
-    found, distance = nearest(other_xyz, moved, _FAR_M)
-    normal = normals[found]
-    across = np.abs(np.sum(normal * (other_xyz[found] - moved), axis=1))
+    found, distance = nearest(other.xyz, moved, _FAR_M)
+    normal = other.normals[found]
+    across = np.abs(np.sum(normal * (other.xyz[found] - moved), axis=1))
     residual = np.where(np.any(normal != 0, axis=1), across, distance)
     residual = np.where(found >= 0, residual, _FAR_M)
-    residual[~(is_open[members] | (distance <= _NEAR_M))] = np.nan
+    residual[~(side.is_open | (distance <= _NEAR_M))] = np.nan
     counted = Groups(np.where(np.isfinite(residual), owner, -1), n)
     return np.where(counted.counts >= _MIN_POINTS, groups.quantile(residual, 0.75), np.nan)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
@@ -14,6 +14,7 @@ from loda_pdal.benchmark.baselines.baseline import Baseline
 from loda_pdal.benchmark.baselines.scene import Block, Marks, Scene, judged_points, read_block, scene_of
 from loda_pdal.benchmark.baselines.tuned import TUNED
 from loda_pdal.benchmark.blocks import split_of_name
+from loda_pdal.benchmark.evaluate import Say
 from loda_pdal.benchmark.metrics import Scores, markdown_table
 from loda_pdal.benchmark.protocols import ScoreReport, combined, judge, judge_instances
 from loda_pdal.model.errors import InputError
@@ -25,8 +26,6 @@ OURS = "loda-pdal"
 
 UNTRAINED = (m3c2.BASELINE, ndsm.BASELINE, c2c.BASELINE)
 """Baselines that need no training blocks."""
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)

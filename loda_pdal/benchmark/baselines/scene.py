@@ -104,8 +104,7 @@ def read_block(folder: Path) -> Block:
     truth = Truth.read(folder / "truth.json")
     clouds = Pair(*(_read(folder / f"{name}.laz") for name in ("before", "after")))
     xyz = clouds.map(lambda cloud: np.column_stack([cloud.x, cloud.y, cloud.z]))
-    low = np.floor(np.min([side.min(axis=0, initial=np.inf) for side in xyz], axis=0) / 1000) * 1000
-    frame = LocalFrame((int(low[0]), int(low[1]), 0) if np.isfinite(low).all() else (0, 0, 0))
+    frame = LocalFrame.about(np.min([side.min(axis=0, initial=np.inf) for side in xyz], axis=0))
 
     def annotated(cloud: Any, points: FloatArray) -> Annotated:
         truth_id = np.asarray(cloud["TruthId"]).astype(np.int64)

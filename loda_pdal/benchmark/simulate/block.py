@@ -152,8 +152,7 @@ def fused_block(block: SimulatedBlock, leaf_m: float) -> SimulatedBlock:
     first of them. The truth stays that of the returns."""
 
     def fused(survey: SimulatedSurvey) -> SimulatedSurvey:
-        low = np.floor(survey.xyz.min(axis=0, initial=np.inf) / 1000.0) * 1000.0 if len(survey) else np.zeros(3)
-        frame = LocalFrame((int(low[0]), int(low[1]), 0))
+        frame = LocalFrame.about(survey.xyz.min(axis=0, initial=np.inf))
         cloud = fuse_points(frame.to_local(survey.xyz), FuseParams(leaf_m=leaf_m))
         first = np.unique(cloud.voxel_idx, return_index=True)[1]
         return SimulatedSurvey(
