@@ -14,7 +14,7 @@ from loda_pdal.benchmark.blocks import split_of_name
 from loda_pdal.benchmark.commands import bench
 from loda_pdal.benchmark.evaluate import interval, run_suite, sources_digest
 from loda_pdal.benchmark.simulate import SimulationOptions
-from loda_pdal.benchmark.suites import MODELS, SEEN, SIZES, SuiteBlock, pieces, split_of_piece, streets
+from loda_pdal.benchmark.suites import MODELS, SEEN, SIZES, SuiteBlock, pieces, split_of_made, split_of_piece, streets
 from loda_pdal.model.errors import InputError
 from loda_pdal.params import Parameters
 
@@ -61,6 +61,13 @@ def test_models_must_be_there(tmp_path: Path) -> None:
         pieces("airborne", "test", tmp_path)
     with pytest.raises(InputError, match="pieces of cities"):
         run_suite(tmp_path, "airborne", "train", Parameters())
+
+
+@pytest.mark.parametrize("suite", ["vehicle", "airborne"])
+@pytest.mark.parametrize("split", ["train", "validation", "test"])
+def test_a_block_tells_its_split(suite: str, split: str, models: Path) -> None:
+    for block in [*streets(suite, split), *islice(pieces(suite, split, models), 3)]:
+        assert split_of_made({"seed": block.seed, "options": block.options.to_dict()}) == split
 
 
 def test_sources_are_told_apart(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ follow from its seed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
@@ -100,12 +100,22 @@ def piece_name(model: str, suite: str, seed: int) -> str:
 
 
 def split_of_piece(model: str, suite: str, seed: int) -> str:
-    """Split of a piece of a city model: by model, and by the hash of its name where that leaves two."""
-    splits = MODELS[model]
+    """Split of a piece of a city model: by model, and by the hash of its name where that leaves more than one."""
+    splits = MODELS.get(model, ())
     if len(splits) == 1:
         return splits[0]
     name = piece_name(model, suite, seed)
+    if not splits:
+        return split_of_name(name)
     return "train" if name in SEEN or hash_share(name) < TRAIN_SHARE else "validation"
+
+
+def split_of_made(made_by: Mapping[str, Any]) -> str:
+    """Split of a block by what its truth says of how it was made (`Truth.made_by`)."""
+    options, seed = made_by.get("options", {}), made_by.get("seed")
+    if city := options.get("city"):
+        return split_of_piece(Path(city).name, options["sensor"], int(made_by["seed"]))
+    return split_of_name(f"seed {seed}")
 
 
 def _block(name: str, split: str, seed: int, suite: str, city: str = "") -> SuiteBlock:

@@ -13,10 +13,10 @@ from loda_pdal.benchmark.baselines import c2c, forest, m3c2, ndsm
 from loda_pdal.benchmark.baselines.baseline import Baseline
 from loda_pdal.benchmark.baselines.scene import Block, Marks, Scene, judged_points, read_block, scene_of
 from loda_pdal.benchmark.baselines.tuned import TUNED
-from loda_pdal.benchmark.blocks import split_of_name
 from loda_pdal.benchmark.evaluate import Say
 from loda_pdal.benchmark.metrics import Scores, markdown_table
 from loda_pdal.benchmark.protocols import ScoreReport, combined, judge, judge_instances
+from loda_pdal.benchmark.suites import split_of_made
 from loda_pdal.model.errors import InputError
 from loda_pdal.model.pair import Pair
 from loda_pdal.params import Parameters
@@ -197,7 +197,7 @@ def _known(folders: Sequence[Path], parameters: Parameters) -> Iterator[tuple[Bl
     """Blocks and scenes to choose parameters on or to train on; `InputError` for a test block."""
     for folder in folders:
         block = read_block(folder)
-        if split_of_name(f"seed {block.truth.made_by.get('seed')}") == "test":
+        if split_of_made(block.truth.made_by) == "test":
             raise InputError(
                 f"{folder} is a test block.", "Tune and train on training or validation blocks.", "test-block"
             )
