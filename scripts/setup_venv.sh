@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes .venv with loda-pdal (editable) and its development tools; does nothing while pyproject.toml stays the same.
+# Makes .venv with loda-pdal (editable) and its development tools; does nothing while pyproject.toml and this script stay the same.
 # PYTHON=... chooses the interpreter (3.11 or later).
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -15,7 +15,7 @@ find_python() {
 }
 
 stamp=.venv/.pyproject.sha256
-wanted=$(sha256sum < pyproject.toml)
+wanted=$(cat pyproject.toml scripts/setup_venv.sh | sha256sum)
 if [ -x .venv/bin/python ] && [ "$(cat $stamp 2>/dev/null)" = "$wanted" ]; then exit 0; fi
 
 if [ ! -x .venv/bin/python ]; then
