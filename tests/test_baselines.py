@@ -211,8 +211,10 @@ def test_holes_take_the_mean_of_their_neighbours(known: dict[str, tuple[Block, S
 
 
 def test_the_search_takes_the_best_of_its_grid(folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    deaf = replace(ndsm.BASELINE, grid={"threshold_m": (100.0, 1.0), "opening": (1,)})
-    monkeypatch.setattr(compare, "UNTRAINED", (deaf,))
+    small = replace(ndsm.BASELINE, grid={"threshold_m": (50.0, 1.0), "opening": (1,)})
+    monkeypatch.setattr(compare, "UNTRAINED", (small,))
+    deaf = replace(TUNED["aerial"][ndsm.BASELINE.name], threshold_m=100.0)
+    monkeypatch.setitem(TUNED["aerial"], ndsm.BASELINE.name, deaf)
     found = tune([folders["changed"]], preset="aerial")
     assert list(found) == [ndsm.BASELINE.name]
     assert found[ndsm.BASELINE.name].params.threshold_m == 1.0

@@ -43,8 +43,9 @@ SIZES = {
 }
 """How many streets and how many pieces of cities each split of a suite has."""
 
-FIRST_STREET, FIRST_PIECE = 101, 501
-"""Seeds are taken in order from here on."""
+FIRST_STREET = {"train": 101, "validation": 101, "test": 201}
+FIRST_PIECE = {"train": 501, "validation": 501, "test": 601}
+"""Seeds are taken in order from here on. What a release was tested on has been looked at since: the next begins above."""
 
 _CONDITIONS = 30
 """Number of the random stream that the conditions of a block come from; the simulator's own are lower."""
@@ -72,7 +73,7 @@ class SuiteBlock:
 def streets(suite: str, split: str) -> list[SuiteBlock]:
     """The procedural blocks of a suite."""
     n = SIZES[suite][split][0]
-    names = (f"seed {seed}" for seed in count(FIRST_STREET))
+    names = (f"seed {seed}" for seed in count(FIRST_STREET[split]))
     seeds = (int(name.split()[1]) for name in names if split_of_name(name) == split)
     return [_block(f"seed_{seed}", split, seed, suite) for seed, _ in zip(seeds, range(n), strict=False)]
 
@@ -88,7 +89,7 @@ def pieces(suite: str, split: str, models: Path) -> Iterator[SuiteBlock]:
         )
     return (
         _block(piece_name(model, suite, seed).replace(" ", "_"), split, seed, suite, str(models / model))
-        for seed in count(FIRST_PIECE)
+        for seed in count(FIRST_PIECE[split])
         for model in names
         if split_of_piece(model, suite, seed) == split
     )

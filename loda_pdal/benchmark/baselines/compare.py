@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -145,23 +144,28 @@ def tune(
 
 
 def _tuned(method: Baseline, start: Any, known: Sequence[tuple[Block, Scene]], say: Say) -> Tuned:
-    """The best of a method's grid; of equally good ones the first."""
-    best = Tuned(start, -1.0)
-    slow = {name: values for name, values in method.grid.items() if name in method.measured_by}
-    fast = {name: values for name, values in method.grid.items() if name not in method.measured_by}
-    for chosen in _combinations(slow):
-        base = replace(start, **chosen)
-        measured = [method.measure(scene, base) for _, scene in known]
-        for also_chosen in _combinations(fast):
-            params = replace(base, **also_chosen)
-            reached = _macro_iou(
-                (block, scene.on_points(method.decide(scene, found, params)))
-                for (block, scene), found in zip(known, measured, strict=True)
-            )
-            if reached > best.macro_iou:
-                best = Tuned(params, reached)
-        say(f"{method.name}: mIoU {100 * best.macro_iou:.1f} with {best.params}")
-    return best
+    """The best that is found by changing one parameter at a time, from ``start`` on, until none gets better."""
+    measured: dict[tuple[Any, ...], list[Any]] = {}
+
+    def reached(params: Any) -> float:
+        key = tuple(getattr(params, name) for name in method.measured_by)
+        if key not in measured:
+            measured[key] = [method.measure(scene, params) for _, scene in known]
+        return _macro_iou(
+            (block, scene.on_points(method.decide(scene, found, params)))
+            for (block, scene), found in zip(known, measured[key], strict=True)
+        )
+
+    tried = {start: reached(start)}
+    best, before = start, None
+    while best != before:
+        before = best
+        for name, values in method.grid.items():
+            candidates = [replace(best, **{name: value}) for value in values]
+            tried |= {params: reached(params) for params in candidates if params not in tried}
+            best = max([best, *candidates], key=tried.__getitem__)
+        say(f"{method.name}: mIoU {100 * tried[best]:.1f} with {best}")
+    return Tuned(best, tried[best])
 
 
 def _macro_iou(answers: Iterable[tuple[Block, Pair[Marks]]]) -> float:
@@ -173,10 +177,6 @@ def _macro_iou(answers: Iterable[tuple[Block, Pair[Marks]]]) -> float:
     ]
     scores = Scores.of([j.instance.label for j in judgements], [j.predicted for j in judgements])
     return scores.macro_iou or 0.0
-
-
-def _combinations(grid: dict[str, tuple[Any, ...]]) -> Iterator[dict[str, Any]]:
-    return (dict(zip(grid, values, strict=True)) for values in product(*grid.values()))
 
 
 def _methods(training: Sequence[Path], parameters: Parameters, say: Say) -> tuple[list[Baseline], dict[str, str]]:
