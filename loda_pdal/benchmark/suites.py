@@ -45,7 +45,7 @@ SIZES = {
 
 FIRST_STREET = {"train": 101, "validation": 101, "test": 201}
 FIRST_PIECE = {"train": 501, "validation": 501, "test": 601}
-"""Seeds are taken in order from here on. What a release was tested on has been looked at since: the next begins above."""
+"""Seeds are taken in order from here on. What a release was tested on was looked at since: the next begins above it."""
 
 _CONDITIONS = 30
 """Number of the random stream that the conditions of a block come from; the simulator's own are lower."""
