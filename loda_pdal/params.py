@@ -331,6 +331,13 @@ class SemanticParams(StageParams):
     mobile_width_m: float = param(3.0, "widest mobile object", unit="m", low=0.5, high=30)
     mobile_height_m: float = param(3.0, "highest mobile object", unit="m", low=0.5, high=30)
     mobile_volume_m3: float = param(60.0, "largest voxelised volume", unit="m3", low=1, high=1000)
+    vehicle_roughness: float = param(
+        0.38,
+        "neighbours on a vehicle lie no farther from each other's planes than this share of their distance; in foliage "
+        "and the smear of traffic they do; 0: no vehicles are looked for but the paper's",
+        low=0,
+        high=1,
+    )
 
 
 @dataclass(frozen=True)
@@ -833,7 +840,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
         "features": {"radius_m": 1.25},
         "superpoints": {"max_edge_m": 2.0},
         "proxies": {"voxel_m": 1.0, "min_voxels": 50},
-        "semantics": {"building_rmse_m": 0.15, "vegetation_sphericity": 0.15},
+        "semantics": {"building_rmse_m": 0.15, "vegetation_sphericity": 0.15, "vehicle_roughness": 0.0},
         "instances": {
             "building_gap_m": 1.2,
             "roof_step_m": 1.0,
@@ -888,6 +895,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
         "superpoints": {"absorb_below": 1},
         "semantics": {
             "vegetation_sphericity": 0.35,
+            "vehicle_roughness": 0.0,
             "split_angle_deg": 0.0,
             "has_roofs": False,
             "points_near_ground_are_ground": False,

@@ -75,13 +75,16 @@ def form_instances(
         buildings = _buildings_by_patches(xyz, n_raw, semantics, params)
     classification[buildings >= 0] = ObjectClass.BUILDING
     classification[(buildings < 0) & (classification == ObjectClass.BUILDING)] = ObjectClass.OTHER
+    is_vehicle = (buildings < 0) & (semantics.vehicle >= 0)
+    classification[is_vehicle] = ObjectClass.MOBILE
 
     if params.join_by_footprint:
-        _judge_clusters(xyz, height, classification, params, rules)
+        _judge_clusters(xyz, height, classification, ~is_vehicle, params, rules)
     vegetation = _vegetation(xyz, n_raw, height, classification == ObjectClass.VEGETATION, params)
     is_mobile = classification == ObjectClass.MOBILE
-    is_mobile &= ~_near_ground_edge(xyz, height, classification, params)
+    is_mobile &= ~is_vehicle & ~_near_ground_edge(xyz, height, classification, params)
     mobile = _mobile(xyz, n_raw, is_mobile, params)
+    mobile = np.where(is_vehicle, semantics.vehicle + mobile.max(initial=-1) + 1, mobile).astype(np.int32)
     other = _other(xyz, classification, (vegetation >= 0) | (mobile >= 0), params)
 
     classes: list[ByteArray] = []
@@ -314,7 +317,12 @@ def _absorbing_patch(centroid: FloatArray, planes, is_large: BoolArray, distance
 
 
 def _judge_clusters(
-    xyz: FloatArray, height: FloatArray, classification: ByteArray, params: InstanceParams, rules: SemanticParams
+    xyz: FloatArray,
+    height: FloatArray,
+    classification: ByteArray,
+    is_asked: BoolArray,
+    params: InstanceParams,
+    rules: SemanticParams,
 ) -> None:
     """Give connected vegetation, mobile and other points one class where they clearly are one thing (in place).
 
@@ -322,7 +330,8 @@ def _judge_clusters(
     connected and fits a vehicle's box is judged as a whole; larger clusters (a car under a tree) are taken apart into
     green and other pieces first, and what then is no vehicle but hangs on vegetation is its trunk or twigs.
     """
-    loose = np.flatnonzero(np.isin(classification, (ObjectClass.VEGETATION, ObjectClass.MOBILE, ObjectClass.OTHER)))
+    is_loose = np.isin(classification, (ObjectClass.VEGETATION, ObjectClass.MOBILE, ObjectClass.OTHER))
+    loose = np.flatnonzero(is_loose & is_asked)
     if len(loose) == 0:
         return
     cluster = euclidean_clusters(xyz[loose], params.building_gap_m)

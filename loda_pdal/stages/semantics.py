@@ -15,6 +15,7 @@ from loda_pdal.model.groups import Groups, consecutive, count_cells
 from loda_pdal.model.labels import ObjectClass
 from loda_pdal.params import SemanticParams
 from loda_pdal.stages.features import Features
+from loda_pdal.stages.parked import parked_vehicles
 
 _LINEARITY, _PLANARITY, _SPHERICITY, _VERTICAL, _HEIGHT = range(5)
 
@@ -46,6 +47,8 @@ class Semantics:
         `ObjectClass` code of each voxel.
     segment : (m,) int32
         The piece of a superpoint that was classified as one: the superpoint itself, or one of its planes.
+    vehicle : (m,) int32
+        Vehicle that each voxel belongs to, -1 none (`parked_vehicles`).
     plane_group : (s,) int32
         Segments with one number lie in one plane after merging coplanar neighbours; -1 where not planar.
     adjacency : (e, 2) int64
@@ -56,6 +59,7 @@ class Semantics:
 
     classification: ByteArray
     segment: IntArray
+    vehicle: IntArray
     plane_group: IntArray
     adjacency: Int64Array
     contact: Int64Array
@@ -112,7 +116,9 @@ def classify(
     if params.points_near_ground_are_ground:
         is_low = np.abs(values[:, _HEIGHT]) < params.ground_distance_m
         classification = np.where(is_low, np.uint8(ObjectClass.GROUND), classification)
-    return Semantics(classification, superpoint, plane_group, adjacency, contact)
+    is_loose = (classification != ObjectClass.GROUND) & (classification != ObjectClass.BUILDING)
+    vehicle = parked_vehicles(xyz, values[:, _HEIGHT].astype(np.float64), features.normals, is_loose, params)
+    return Semantics(classification, superpoint, vehicle, plane_group, adjacency, contact)
 
 
 def split_at_edges(

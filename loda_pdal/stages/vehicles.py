@@ -11,12 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loda_pdal.kernels.neighbours import knn, nearest
+from loda_pdal.kernels.neighbours import nearest
 from loda_pdal.model.boxes import upright_boxes
 from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array, IntArray
 from loda_pdal.model.groups import Groups, count_cells
 from loda_pdal.model.pair import Pair
 from loda_pdal.stages.cues import Surface
+from loda_pdal.stages.parked import across
 
 _ITERATIONS = 10
 _REACH_M = 0.6
@@ -42,7 +43,6 @@ ONE_VEHICLE_M = (2.8, 7.0)
 
 _LEAST_FILL = 0.6
 _CELL_M = 0.5
-_NEIGHBOURS = 4
 _MIN_POINTS = 30
 _APART_M = 100.0
 """Vehicles are lifted so far from each other that none sees another: one search serves them all."""
@@ -80,12 +80,9 @@ def roughness(surfaces: Pair[Surface], is_asked: BoolArray) -> FloatArray:
         members = np.flatnonzero(np.append(is_asked, False)[side.owner])
         if len(members) < 2:
             continue
-        xyz, normals = side.xyz[members], side.normals[members].astype(np.float64)
-        neighbour = knn(xyz, _NEIGHBOURS, _REACH_M).idx
-        offset = xyz[neighbour] - xyz[:, None, :]
-        across = np.abs(np.einsum("ijk,ijk->ij", normals[neighbour], offset))
+        neighbour, distance, _ = across(side.xyz[members], side.normals[members])
         label = np.where(neighbour >= 0, side.owner[members][:, None], -1)
-        rough.append(Groups(label.ravel(), n).quantile(across.ravel(), 0.75))
+        rough.append(Groups(label.ravel(), n).quantile(distance.ravel(), 0.75))
     return np.asarray(np.fmax.reduce(rough))
 
 
