@@ -81,10 +81,12 @@ def form_instances(
     if params.join_by_footprint:
         _judge_clusters(xyz, height, classification, ~is_vehicle, params, rules)
     vegetation = _vegetation(xyz, n_raw, height, classification == ObjectClass.VEGETATION, params)
-    is_mobile = classification == ObjectClass.MOBILE
-    is_mobile &= ~is_vehicle & ~_near_ground_edge(xyz, height, classification, params)
-    mobile = _mobile(xyz, n_raw, is_mobile, params)
-    mobile = np.where(is_vehicle, semantics.vehicle + mobile.max(initial=-1) + 1, mobile).astype(np.int32)
+    if rules.vehicle_roughness > 0:  # what was looked for and not found is no vehicle
+        mobile = np.where(is_vehicle, semantics.vehicle, -1).astype(np.int32)
+    else:
+        is_mobile = classification == ObjectClass.MOBILE
+        is_mobile &= ~_near_ground_edge(xyz, height, classification, params)
+        mobile = _mobile(xyz, n_raw, is_mobile, params)
     other = _other(xyz, classification, (vegetation >= 0) | (mobile >= 0), params)
 
     classes: list[ByteArray] = []
@@ -370,6 +372,7 @@ def _judge(
         & (voxel_volume(xyz, cluster, n, 0.5) < rules.mobile_volume_m3)
     )
     is_body = (length > 1.5) & (width > 0.9) & (tall > 0.8) & (groups.minimum(height) < 0.8)
+    is_body &= rules.vehicle_roughness == 0
     is_green = groups.share(classification == ObjectClass.VEGETATION) >= 0.5
     judged = np.select([is_green, is_body], [ObjectClass.VEGETATION, ObjectClass.MOBILE], ObjectClass.OTHER).astype(
         np.uint8
