@@ -1,12 +1,10 @@
 """Does a wall, fence or hoarding still stand where it stood (beyond the paper, which asks for height and volume alone).
 
 One for the other in the same line has the same overlap, and often the same height. But what stands fixed does not step
-aside: where its upright faces lie elsewhere, all to one side and by more than can be missed, another one was put there.
+aside: where nearly all of its upright faces lie elsewhere, by more than can be missed, another one was put there.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 
@@ -24,7 +22,7 @@ _UPRIGHT = 0.5
 """Normals of upright faces are no steeper than this."""
 
 _ALIGNED = 0.8
-"""Cosine between the normals of faces that are compared, and between them and the axis that they mostly face."""
+"""Half the length of the sum of two normals of faces that are compared."""
 
 _MIN_FACES = 50
 
@@ -32,9 +30,8 @@ _MIN_FACES = 50
 def face_offset(surfaces: Pair[Surface], is_asked: BoolArray) -> FloatArray:
     """How far the upright faces of objects lie apart in the two epochs, (n,) m.
 
-    The median over all points of both epochs of the offset from the other epoch's surface, along the axis that the
-    object mostly faces; 0 where the faces did not move as one (a quarter of them by less than half of that), NaN where
-    not asked for or too few faces.
+    The median over the points of both epochs of the distance from the other epoch's face along their common normal, or
+    twice the lower quartile if that is less: most of the thing is where it was. NaN where not asked for, or too few.
 
     Parameters
     ----------
@@ -47,45 +44,23 @@ def face_offset(surfaces: Pair[Surface], is_asked: BoolArray) -> FloatArray:
     if not is_asked.any():
         return np.full(n, np.nan)
     before, after = lifted(surfaces, is_asked)
-    forth, back = _offsets(before, after), _offsets(after, before)
-    owner = np.concatenate([forth.owner, back.owner])
-    normal = np.concatenate([forth.normal, back.normal])
-    offset = np.concatenate([forth.offset, -back.offset])
-    axis = _main_axis(normal, Groups(owner, n))
-    along = np.sum(normal * axis[owner], axis=1)
-    offset = offset * np.sign(along)
-    faces = Groups(np.where(np.abs(along) > _ALIGNED, owner, -1), n)
-    median = faces.median(offset)
-    least = faces.quantile(offset * np.sign(median)[owner], 0.25)
-    moved = np.where(least > np.abs(median) / 2, np.abs(median), 0.0)
-    return np.where(faces.counts >= _MIN_FACES, moved, np.nan)
+    forth, back = _apart(before, after), _apart(after, before)
+    faces = Groups(np.concatenate([forth[0], back[0]]), n)
+    apart = np.concatenate([forth[1], back[1]])
+    offset = np.fmin(faces.median(apart), 2 * faces.quantile(apart, 0.25))
+    return np.where(faces.counts >= _MIN_FACES, offset, np.nan)
 
 
-class _Faces(NamedTuple):
-    """Upright faces of one epoch: the object (k,), the horizontal normal (k, 2) that both epochs share, and how far the
-    other epoch's face lies along it (k,) m."""
-
-    owner: IntArray
-    normal: FloatArray
-    offset: FloatArray
-
-
-def _offsets(side: Aloft, other: Aloft) -> _Faces:
-    """The faces of one epoch that have one of the other epoch beside them."""
+def _apart(side: Aloft, other: Aloft) -> tuple[IntArray, FloatArray]:
+    """Object (k,) of the upright faces of one epoch that have one of the other epoch beside them, and how far that lies
+    from them along both normals' mean (k,) m."""
+    if len(other.xyz) == 0:
+        return np.zeros(0, np.int32), np.zeros(0)
     found, _ = nearest(other.xyz, side.xyz, _REACH_M)
-    theirs = other.normals[found] if len(other.xyz) else np.zeros_like(side.normals)
+    theirs = other.normals[found]
     theirs = np.where(np.sum(side.normals * theirs, axis=1, keepdims=True) < 0, -theirs, theirs)
-    mean = side.normals + theirs
+    mean = (side.normals + theirs) / 2
     length = np.linalg.norm(mean, axis=1)
-    is_face = np.flatnonzero((found >= 0) & (length > 2 * _ALIGNED) & (np.abs(mean[:, 2]) < _UPRIGHT * length))
-    normal = mean[is_face] / length[is_face, None]
-    offset = np.sum(normal * (other.xyz[found[is_face]] - side.xyz[is_face]), axis=1)
-    return _Faces(side.owner[is_face], normal[:, :2], offset)
-
-
-def _main_axis(normal: FloatArray, groups: Groups) -> FloatArray:
-    """The horizontal direction (n, 2) that the normals (k, 2) of each group mostly lie along, to one fixed side."""
-    scatter = groups.sum(normal[:, :, None] * normal[:, None, :])
-    axis = np.linalg.eigh(scatter)[1][:, :, 1]
-    leading = np.take_along_axis(axis, np.argmax(np.abs(axis), axis=1)[:, None], axis=1)
-    return np.where(leading < 0, -axis, axis)
+    is_face = (found >= 0) & (length > _ALIGNED) & (np.abs(mean[:, 2]) < _UPRIGHT * length)
+    across = np.abs(np.sum(mean * (other.xyz[found] - side.xyz), axis=1))
+    return side.owner[is_face], across[is_face] / length[is_face]
