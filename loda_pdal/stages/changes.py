@@ -185,10 +185,9 @@ def _divided(surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, p
 def _is_replaced(cast: Cast, cues: list[Cue], is_open: Pair[BoolArray], params: ChangeParams) -> BoolArray:
     """Which vehicles, walls and fences stand where another one stood."""
     is_pair = np.array([cue.is_before and cue.is_after for cue in cues], dtype=np.bool_)
-    is_loose = is_pair & (cast.object_class != ObjectClass.BUILDING) & (params.replaced_m > 0)
+    is_loose = np.isin(cast.object_class, (ObjectClass.MOBILE, ObjectClass.OTHER)) & is_pair & (params.replaced_m > 0)
     is_vehicle = looks_like_vehicle(cast.surfaces, len(cast))
-    is_fixed = is_loose & (cast.object_class != ObjectClass.VEGETATION) & ~is_vehicle
-    is_another = _stands_aside(cast, cues, is_fixed, params)
+    is_another = _stands_aside(cast, cues, is_loose & ~is_vehicle, params)
     is_large = np.array([cue.n_voxels >= _LEAST_VEHICLE for cue in cues], dtype=np.bool_)
     is_asked = is_loose & is_vehicle & is_large
     off = shape_change(cast.surfaces, is_open, is_asked)
