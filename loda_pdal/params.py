@@ -513,8 +513,8 @@ class ChangeParams(StageParams):
     )
     replaced_m: float = param(
         0.06,
-        "how far a quarter of a parked vehicle's surface must be off, after the best move, to make it another one; "
-        "0: never",
+        "how far a quarter of a parked vehicle's surface must be off, after the best move, to make it another one, and "
+        "how far apart the faces of what stands fixed must be; 0: never",
         unit="m",
         low=0,
         high=10,

@@ -207,6 +207,26 @@ def test_another_vehicle_in_the_same_slot_is_told_by_its_shape(
     assert sorted(labels(found)) == expected
 
 
+@pytest.mark.parametrize(
+    ("after", "object_class", "is_other"),
+    [
+        (block(0, 0.1, 8, 0.5, 1), ObjectClass.OTHER, True),
+        (block(0, 0.1, 8, 0.5, 1), ObjectClass.MOBILE, True),
+        (block(0, 0.1, 8, 0.5, 1), ObjectClass.VEGETATION, False),
+        (block(0, 0.04, 8, 0.5, 1), ObjectClass.OTHER, False),
+        (joined(block(0, 0, 5, 0.5, 1), block(5, 0.1, 3, 0.5, 1)), ObjectClass.OTHER, False),
+    ],
+    ids=["aside", "taken for a vehicle", "a hedge", "within the limit", "most of it in its place"],
+)
+def test_another_wall_in_the_same_line_is_told_by_its_faces(
+    after: tuple[FloatArray, FloatArray], object_class: ObjectClass, is_other: bool
+) -> None:
+    before, after_side = surface((0, block(0, 0, 8, 0.5, 1))), surface((0, after))
+    expected = [ChangeLabel.ADDED, ChangeLabel.REMOVED] if is_other else [ChangeLabel.UNCHANGED]
+    assert sorted(labels(decide(before, after_side, object_class))) == expected
+    assert sorted(labels(decide(after_side, before, object_class))) == expected
+
+
 def test_vegetation_grows_above_its_own_limit_only() -> None:
     shrub = block(0, 0, 4, 4, 3)
     for top, expected in ((3.2, ChangeLabel.UNCHANGED), (4.5, ChangeLabel.INCREASED)):

@@ -19,6 +19,7 @@ from loda_pdal.stages.cast import FOLIAGE_M, Cast
 from loda_pdal.stages.confidence import calibrated
 from loda_pdal.stages.correspondence import rank_by_place
 from loda_pdal.stages.cues import Evidence, Surface, Voxels, sample_voxels, weigh
+from loda_pdal.stages.faces import face_offset
 from loda_pdal.stages.observability import Coverage
 from loda_pdal.stages.parts import largest_regions, split_parts
 from loda_pdal.stages.rules import (
@@ -182,20 +183,30 @@ def _divided(surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, p
 
 
 def _is_replaced(cast: Cast, cues: list[Cue], is_open: Pair[BoolArray], params: ChangeParams) -> BoolArray:
-    """Which vehicles stand where another one stood."""
+    """Which vehicles, walls and fences stand where another one stood."""
     is_pair = np.array([cue.is_before and cue.is_after for cue in cues], dtype=np.bool_)
-    is_loose = np.isin(cast.object_class, (ObjectClass.MOBILE, ObjectClass.OTHER))
+    is_loose = np.isin(cast.object_class, (ObjectClass.MOBILE, ObjectClass.OTHER)) & is_pair & (params.replaced_m > 0)
+    is_vehicle = looks_like_vehicle(cast.surfaces, len(cast))
+    is_another = _stands_aside(cast, cues, is_loose & ~is_vehicle, params)
     is_large = np.array([cue.n_voxels >= _LEAST_VEHICLE for cue in cues], dtype=np.bool_)
-    is_asked = is_pair & is_loose & is_large & (params.replaced_m > 0)
-    is_asked &= looks_like_vehicle(cast.surfaces, len(cast))
+    is_asked = is_loose & is_vehicle & is_large
     off = shape_change(cast.surfaces, is_open, is_asked)
     rough = roughness(cast.surfaces, is_asked)
-    is_another = (off > np.fmax(params.replaced_m, _ROUGH * rough)) & (rough < FOLIAGE_M)
+    is_another |= (off > np.fmax(params.replaced_m, _ROUGH * rough)) & (rough < FOLIAGE_M)
     if params.replaced_top_m > 0:
         rise = np.array([abs(cue.dh) for cue in cues])
         is_mobile = is_pair & (cast.object_class == ObjectClass.MOBILE)
         is_another |= is_mobile & np.isnan(off) & (rise > params.replaced_top_m)
     return np.asarray(is_another)
+
+
+def _stands_aside(cast: Cast, cues: list[Cue], is_asked: BoolArray, params: ChangeParams) -> BoolArray:
+    """Which of the solid things asked for have their faces elsewhere than before."""
+    aside = face_offset(cast.surfaces, is_asked)
+    lod95 = np.array([cue.lod95 for cue in cues], dtype=np.float64)
+    limit = np.fmax(params.replaced_m, params.lod_factor * lod95 if params.use_lod else 0.0)
+    is_off = aside > limit
+    return is_off & (roughness(cast.surfaces, is_off) < FOLIAGE_M)
 
 
 _LEAST_VEHICLE = 50

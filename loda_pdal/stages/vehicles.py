@@ -13,7 +13,7 @@ import numpy as np
 
 from loda_pdal.kernels.neighbours import nearest
 from loda_pdal.model.boxes import upright_boxes
-from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array, IntArray
+from loda_pdal.model.cloud import BoolArray, FloatArray, IntArray
 from loda_pdal.model.groups import Groups, count_cells
 from loda_pdal.model.pair import Pair
 from loda_pdal.stages.cues import Surface
@@ -65,8 +65,7 @@ def shape_change(surfaces: Pair[Surface], is_open: Pair[BoolArray], is_asked: Bo
     """
     if not is_asked.any():
         return np.full(len(is_asked), np.nan)
-    lift = np.where(is_asked, np.cumsum(is_asked), -1)
-    sides = surfaces.join(is_open, lambda side, seen: _parked(side, seen, is_asked, lift))
+    sides = lifted(surfaces, is_asked, is_open)
     n = len(is_asked)
     return np.fmin(_residual(sides.before, sides.after, n), _residual(sides.after, sides.before, n))
 
@@ -102,8 +101,8 @@ def looks_like_vehicle(
     return fits
 
 
-class _Parked(NamedTuple):
-    """The points (k,) of the vehicles of one epoch, each vehicle at a height of its own."""
+class Aloft(NamedTuple):
+    """The points (k,) of some objects of one epoch, each object at a height of its own."""
 
     owner: IntArray
     xyz: FloatArray
@@ -111,14 +110,20 @@ class _Parked(NamedTuple):
     is_open: BoolArray
 
 
-def _parked(surface: Surface, is_open: BoolArray, is_asked: BoolArray, lift: Int64Array) -> _Parked:
-    members = np.flatnonzero(np.append(is_asked, False)[surface.owner])
-    owner, xyz = surface.owner[members], surface.xyz[members].copy()
-    xyz[:, 2] += _APART_M * lift[owner]
-    return _Parked(owner, xyz, surface.normals[members].astype(np.float64), is_open[members])
+def lifted(surfaces: Pair[Surface], is_asked: BoolArray, is_open: Pair[BoolArray] | None = None) -> Pair[Aloft]:
+    """The points of the objects ``is_asked`` (n,), lifted so far that none sees another; open if that is not said."""
+    lift = _APART_M * np.cumsum(is_asked)
+
+    def of_epoch(surface: Surface, seen: BoolArray) -> Aloft:
+        members = np.flatnonzero(np.append(is_asked, False)[surface.owner])
+        owner, xyz = surface.owner[members], surface.xyz[members].copy()
+        xyz[:, 2] += lift[owner]
+        return Aloft(owner, xyz, surface.normals[members].astype(np.float64), seen[members])
+
+    return surfaces.join(is_open or surfaces.map(lambda side: np.ones(len(side.owner), np.bool_)), of_epoch)
 
 
-def _residual(side: _Parked, other: _Parked, n: int) -> FloatArray:
+def _residual(side: Aloft, other: Aloft, n: int) -> FloatArray:
     """Upper quartile (n,) m of the residuals of one epoch's points on the other's."""
     owner, xyz = side.owner, side.xyz
     groups = Groups(owner, n)
