@@ -18,7 +18,7 @@ from loda_pdal.params import ChangeParams, ConfidenceParams, ObservabilityParams
 from loda_pdal.stages.cast import FOLIAGE_M, Cast
 from loda_pdal.stages.confidence import calibrated
 from loda_pdal.stages.correspondence import rank_by_place
-from loda_pdal.stages.cues import Evidence, Surface, Voxels, sample_voxels, weigh
+from loda_pdal.stages.cues import Evidence, Surface, Voxels, sample_voxels, share_beneath, weigh
 from loda_pdal.stages.observability import Coverage
 from loda_pdal.stages.parts import largest_regions, split_parts
 from loda_pdal.stages.rules import (
@@ -158,9 +158,11 @@ def _divided(surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, p
     cells = cast.cells(voxels, params)
     evidence = weigh(cells, cast.surfaces, len(cast), params)
     cues = cues_of(evidence, cast.object_class)
+    is_building = cast.object_class == ObjectClass.BUILDING
     is_inner = np.array([is_within(cue, params) for cue in cues], dtype=np.bool_)
     is_apart = np.array([is_no_pair(cue, params) for cue in cues], dtype=np.bool_) & ~is_inner
-    is_apart |= _is_replaced(cast, cues, voxels.at_points(cells.is_seen.swapped, cast.surfaces), params)
+    is_open = voxels.at_points(cells.is_seen.swapped, cast.surfaces)
+    is_apart |= _is_replaced(cast, cues, is_open, params) & (share_beneath(cells, is_building) < _MOST_BENEATH)
     if is_apart.any() or is_inner.any():
         cast = cast.without_pairs(is_apart)
         cast = cast.without_surroundings(is_inner, voxels.at_points(cells.is_near.swapped, cast.surfaces))
@@ -200,6 +202,9 @@ def _is_replaced(cast: Cast, cues: list[Cue], is_open: Pair[BoolArray], params: 
 
 _LEAST_VEHICLE = 50
 """Voxels of a vehicle."""
+
+_MOST_BENEATH = 0.5
+"""Of what is a vehicle no more lies beneath a building: a piece of a wall has more of the house above it."""
 
 _ROUGH = 1.0
 """A shape must be off by more than this many times its own roughness."""

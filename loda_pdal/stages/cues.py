@@ -232,8 +232,9 @@ class Evidence:
     gained, lost
         Voxels that only the after, or only the before epoch has, where the other could have seen them;
         ``gained_above`` and ``lost_above`` are those beyond the other epoch's top.
-    column_rise : m
-        Median change of the top over the columns that both epochs occupy; NaN with fewer than eight of them.
+    column_rise, column_scatter : m
+        Median change of the top over the columns that both epochs occupy, and what lies between the quartiles of these
+        changes; NaN with fewer than eight of them.
     iou, shift : 3D overlap of the occupancy, and distance of the centroids (m).
     dh : m
         Change of the height that the parameters name.
@@ -266,6 +267,7 @@ class Evidence:
     gained_above: FloatArray
     lost_above: FloatArray
     column_rise: FloatArray
+    column_scatter: FloatArray
     lod95: FloatArray
     observability: FloatArray
     hidden: FloatArray
@@ -387,6 +389,21 @@ def _is_beneath(voxels: Voxels, owner: IntArray, other: IntArray) -> BoolArray:
     return np.asarray(is_found & (voxels.cell[highest[place], 2] >= voxels.cell[:, 2]))
 
 
+def share_beneath(cells: Cells, is_roof: BoolArray) -> FloatArray:
+    """Share (n,) of each object's voxels in whose columns either epoch has one of the objects ``is_roof`` (n,) above."""
+    voxels, n = cells.voxels, len(is_roof)
+    if len(voxels) == 0:
+        return np.zeros(n)
+    is_held = cells.owner.map(lambda side: np.append(is_roof, False)[side])
+    z = voxels.cell[:, 2]
+    low = z.min() - 1
+    top = np.maximum.reduceat(np.where(is_held.before | is_held.after, z, low), voxels.columns[:-1])
+    is_beneath = z < np.repeat(top, np.diff(voxels.columns))
+    voxel, owner = _either(cells)
+    held = np.bincount(owner, minlength=n)
+    return np.bincount(owner, weights=is_beneath[voxel], minlength=n) / np.maximum(held, 1)
+
+
 def _slots(cells: Pair[Int64Array]) -> tuple[Int64Array, Int64Array, Int64Array, Int64Array]:
     """Voxels (c, 3) of the points, first voxel of each column, order (k,) of all points by slot, and first of each."""
     rows = np.concatenate(list(cells))
@@ -461,6 +478,9 @@ def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -
     columns = _column_tops(voxels, surfaces, n)
     summit = columns.top.map(lambda top: _summit(columns.owner, top, n))
     top = height if params.height_reference == "ground" else summit
+    column_rise, column_scatter = _rise_of_columns(
+        _fair_rises(voxels, surfaces, n) if params.fair_tops else columns.rises, n
+    )
     z = voxels.centre[:, 2]
     centroid = own.join(is_known, lambda side, known: Groups(np.where(known, side, -1), n).mean(voxels.centre))
     return Evidence(
@@ -480,7 +500,8 @@ def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -
         d_typical=np.where(is_sampled, samples.median(np.abs(displacement)), np.nan),
         gained_above=_count(own.after, cells.is_gained & _is_above(z, own.after, summit.before), n, cells.odds.before),
         lost_above=_count(own.before, cells.is_lost & _is_above(z, own.before, summit.after), n, cells.odds.after),
-        column_rise=_median_rise(_fair_rises(voxels, surfaces, n) if params.fair_tops else columns.rises, n),
+        column_rise=column_rise,
+        column_scatter=column_scatter,
         lod95=Groups(owner, n).median(voxels.lod95[voxel]),
         observability=(n_known.before + n_known.after) / np.maximum(n_voxels.before + n_voxels.after, 1),
         hidden=(n_hidden.before + n_hidden.after) / np.maximum(n_voxels.before + n_voxels.after, 1),
@@ -573,10 +594,13 @@ def _summit(owner: IntArray, top: FloatArray, n: int) -> FloatArray:
     return Groups(owner[is_known], n).quantile(top[is_known], 0.95)
 
 
-def _median_rise(rises: tuple[IntArray, FloatArray], n: int) -> FloatArray:
-    """Median change of the columns' tops (n,) m over the columns that both epochs have."""
+def _rise_of_columns(rises: tuple[IntArray, FloatArray], n: int) -> tuple[FloatArray, FloatArray]:
+    """Median change of the columns' tops (n,) m over the columns that both epochs have, and the distance (n,) m of the
+    quartiles."""
     groups = Groups(rises[0], n)
-    return np.where(groups.counts >= _LEAST_COLUMNS, groups.median(rises[1]), np.nan)
+    is_told = groups.counts >= _LEAST_COLUMNS
+    scatter = groups.quantile(rises[1], 0.75) - groups.quantile(rises[1], 0.25)
+    return np.where(is_told, groups.median(rises[1]), np.nan), np.where(is_told, scatter, np.nan)
 
 
 _LEAST_COLUMNS = 8
