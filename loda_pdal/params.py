@@ -500,6 +500,11 @@ class ChangeParams(StageParams):
         "what is solid is gained or lost only where the other survey shows something beneath it and nothing of the "
         "same object above it: else it was hidden",
     )
+    needs_returns: bool = param(
+        False,
+        "a voxel is gained or lost only where the other survey has a return beneath it, in its column or beside it: a "
+        "wet roof that returned nothing was not taken down",
+    )
     fair_tops: bool = param(True, "columns' tops are compared as if both epochs had equally many points in them")
     volume_sigmas: float = param(
         0.0, "gained less lost voxels must exceed this many times the root of their sum; 0: need not", low=0, high=100
@@ -590,7 +595,13 @@ class ChangeParams(StageParams):
 
     def for_bodies(self) -> ChangeParams:
         """The parameters for buildings that are filled."""
-        return replace(self, voxel_m=self.body_voxel_m, query_radius_m=self.body_query_radius_m, weighs_sampling=False)
+        return replace(
+            self,
+            voxel_m=self.body_voxel_m,
+            query_radius_m=self.body_query_radius_m,
+            weighs_sampling=False,
+            needs_returns=True,
+        )
 
 
 @dataclass(frozen=True)

@@ -310,10 +310,15 @@ def sample_voxels(
     over = Pair(always, always)
     if params.needs_sight or params.thing_voxels > 0:
         over = surfaces.map(lambda surface: _is_over(centre, cell, columns, surface.xyz, params.voxel_m))
+    if params.needs_returns:
+        measured = surfaces.map(lambda surface: surface.xyz[surface.n_raw > 0])
+        over = measured.map(lambda points: _is_over(centre, cell, columns, points, params.voxel_m, reach=1))
     if coverage:
         shown = coverage.map(lambda side: side.shown(cell, params.voxel_m))
         hidden = shown.map(lambda rays: rays.is_hidden)
         covered = coverage.join(shown, lambda side, rays: rays.corrected(side.at(centre)))
+        if params.needs_returns:
+            covered = covered.join(over, np.logical_and)
         is_open = coverage.swapped.join(xyz, lambda other, points: other.at(points))
     return Voxels(
         cell=cell,
@@ -361,15 +366,22 @@ def cells_with_owners(
     return Cells(voxels, owner, is_seen, n_raw.map(lambda points: points > 0), odds)
 
 
-def _is_over(centre: FloatArray, cell: Int64Array, columns: Int64Array, xyz: FloatArray, voxel_m: float) -> BoolArray:
-    """Whether any of the points (m, 3) lies in the column of each voxel (c,), beneath its centre."""
+def _is_over(
+    centre: FloatArray, cell: Int64Array, columns: Int64Array, xyz: FloatArray, voxel_m: float, reach: int = 0
+) -> BoolArray:
+    """Whether any of the points (m, 3) lies beneath the centre of each voxel (c,), in its column or at most ``reach``
+    columns beside it."""
     first = columns[:-1]
     if len(first) == 0 or len(xyz) == 0:
         return np.zeros(len(cell), np.bool_)
     plan = cell[first, :2]
     lattice = Lattice.around(plan)
-    column = lattice.find(lattice.keys(plan), cells_of(xyz[:, :2], voxel_m))
-    lowest = np.fmin(Groups(column, len(first)).minimum(xyz[:, 2]), np.inf)
+    keys = lattice.keys(plan)
+    lowest = np.full(len(first), np.inf)
+    place = cells_of(xyz[:, :2], voxel_m)
+    for step in np.ndindex(2 * reach + 1, 2 * reach + 1):
+        column = lattice.find(keys, place + (np.array(step) - reach))
+        lowest = np.fmin(lowest, Groups(column, len(first)).minimum(xyz[:, 2]))
     return np.asarray(np.repeat(lowest, np.diff(columns)) < centre[:, 2])
 
 
@@ -390,7 +402,7 @@ def _is_beneath(voxels: Voxels, owner: IntArray, other: IntArray) -> BoolArray:
 
 
 def share_beneath(cells: Cells, is_roof: BoolArray) -> FloatArray:
-    """Share (n,) of each object's voxels in whose columns either epoch has one of the objects ``is_roof`` (n,) above."""
+    """Share (n,) of each object's voxels that lie beneath one of the objects ``is_roof`` (n,) in either epoch."""
     voxels, n = cells.voxels, len(is_roof)
     if len(voxels) == 0:
         return np.zeros(n)
@@ -479,7 +491,7 @@ def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -
     summit = columns.top.map(lambda top: _summit(columns.owner, top, n))
     top = height if params.height_reference == "ground" else summit
     column_rise, column_scatter = _rise_of_columns(
-        _fair_rises(voxels, surfaces, n) if params.fair_tops else columns.rises, n
+        _fair_rises(voxels, surfaces, n) if params.fair_tops else columns.rises, n, _LEAST_COLUMNS
     )
     z = voxels.centre[:, 2]
     centroid = own.join(is_known, lambda side, known: Groups(np.where(known, side, -1), n).mean(voxels.centre))
@@ -588,17 +600,23 @@ def _column_tops(voxels: Voxels, surfaces: Pair[Surface], n: int) -> _Columns:
     return _Columns(owner[is_column], Pair(*np.ascontiguousarray(top[is_column].T)))
 
 
+def median_rise(voxels: Voxels, surfaces: Pair[Surface], n: int, least: int) -> FloatArray:
+    """How far the tops of each object (n,) rise, m, in the median of the columns that both epochs have of it; NaN with
+    fewer than ``least`` of these."""
+    return _rise_of_columns(_column_tops(voxels, surfaces, n).rises, n, least)[0]
+
+
 def _summit(owner: IntArray, top: FloatArray, n: int) -> FloatArray:
     """95th percentile (n,) m of the tops of each object's columns."""
     is_known = np.isfinite(top)
     return Groups(owner[is_known], n).quantile(top[is_known], 0.95)
 
 
-def _rise_of_columns(rises: tuple[IntArray, FloatArray], n: int) -> tuple[FloatArray, FloatArray]:
+def _rise_of_columns(rises: tuple[IntArray, FloatArray], n: int, least: int) -> tuple[FloatArray, FloatArray]:
     """Median change of the columns' tops (n,) m over the columns that both epochs have, and the distance (n,) m of the
-    quartiles."""
+    quartiles; NaN with fewer than ``least`` columns."""
     groups = Groups(rises[0], n)
-    is_told = groups.counts >= _LEAST_COLUMNS
+    is_told = groups.counts >= least
     scatter = groups.quantile(rises[1], 0.75) - groups.quantile(rises[1], 0.25)
     return np.where(is_told, groups.median(rises[1]), np.nan), np.where(is_told, scatter, np.nan)
 

@@ -27,6 +27,9 @@ _LINK_VOXELS = 2.9
 _MOST_OF = 0.5
 """A region that takes more than this share of an object's columns is no part of it: the object itself changed."""
 
+_LEAST_ANNEX_M = 1.0
+"""What is built onto a house is longer: a drainpipe, or the stem of a tree that leans over the roof, is no annex."""
+
 _WIDE = 0.6
 """Storeys wider than this many frontages are those of a house of their own."""
 
@@ -279,7 +282,8 @@ def _claim(
         if is_free.any():
             width_m = float((np.ptp(region.columns, axis=0) + 1).max()) * params.voxel_m
             is_storey = region.share_new < 0.5 and width_m > _WIDE * params.frontage_m
-            is_extension.append(bool(has_houses[region.parent]) and not is_new and not is_storey)
+            is_annex = width_m > _LEAST_ANNEX_M and not is_new and not is_storey
+            is_extension.append(bool(has_houses[region.parent]) and is_annex)
             if is_in_row and is_extension[-1]:
                 in_rows.append((len(parents), region))
             part_of[first:last][is_free] = len(parents)

@@ -210,7 +210,7 @@ _LEAST_EMPTY = 0.2
 def _mobile(cue: Cue, params: ChangeParams) -> Verdict:
     """Matched mobile objects (paper, section 4.3): the same in its place, or the epoch with more of its own space."""
     figures = f"overlap {cue.iou:.2f}, centre moved {cue.shift:.2f} m"
-    is_near = cue.shift < params.mobile_shift_m or not _is_apart(cue, params)
+    is_near = cue.shift < params.mobile_shift_m or cue.iou >= params.min_support
     if cue.iou > params.mobile_iou and is_near:
         return Verdict(
             ChangeLabel.UNCHANGED, f"in its place: {figures} (limits {params.mobile_iou} and {params.mobile_shift_m} m)"
