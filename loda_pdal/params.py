@@ -471,6 +471,13 @@ class ChangeParams(StageParams):
     min_support: float = param(
         0.5, "share of an unmatched object's surface in the other survey that makes it Unchanged", low=0, high=1
     )
+    min_returns: int = param(
+        12,
+        "returns that a survey must have of what the other lacks: stray ones behind a window come and go; fewer are "
+        "Undetermined; 0: any",
+        low=0,
+        high=10000,
+    )
     within_share: float = param(
         0.2,
         "a plant or other object of which the other survey shows less than this share is another one, and what it "
@@ -873,6 +880,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "part_min_width_m": 1.5,
             "plant_width_m": 2.5,
             "needs_sight": False,
+            "min_returns": 8,
             "within_share": 0.0,
             "plant_rise_m": 0.0,
             "fair_tops": False,
@@ -918,6 +926,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "backing_share": 0.0,
             "min_expected_points": 0.0,
             "needs_sight": False,
+            "min_returns": 0,
             "within_share": 0.0,
             "plant_rise_m": 0.0,
             "fair_tops": False,

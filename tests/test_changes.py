@@ -188,6 +188,23 @@ def test_a_stem_before_a_house_does_not_change_it() -> None:
     assert labels(found)[int(found.owner.after[0])] == ChangeLabel.UNCHANGED
 
 
+def test_one_of_a_pair_of_houses_is_removed_and_the_other_stays() -> None:
+    neighbour = block(7, 0, 7, 8, 6)
+    house = block(0, 0, 7, 8, 6)
+    found = decide(surface((0, joined(house, neighbour))), surface((0, house)), ObjectClass.BUILDING)
+    assert sorted(labels(found)) == [ChangeLabel.UNCHANGED, ChangeLabel.REMOVED]
+    assert labels(found)[int(found.owner.after[0])] == ChangeLabel.UNCHANGED
+
+
+def test_what_a_few_returns_show_is_undetermined() -> None:
+    thing = block(0, 0, 0.5, 0.5, 1)
+    few = (thing[0][:2], thing[1][:2])
+    assert labels(decide(surface((0, thing)), surface(), ObjectClass.OTHER)) == [ChangeLabel.REMOVED]
+    found = decide(surface((0, few)), surface(), ObjectClass.OTHER)
+    assert labels(found) == [ChangeLabel.UNDETERMINED]
+    assert found.reason == ("too little of it to tell: 10 returns (at least 12 needed)",)
+
+
 def test_a_porch_on_a_row_changes_one_frontage_of_it() -> None:
     row = block(0, 0, 40, 8, 6)
     is_hidden = (np.abs(row[0][:, 0] - 21.25) < 1.25) & (row[0][:, 1] == 0) & (row[0][:, 2] < 2.75)

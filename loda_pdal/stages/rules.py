@@ -45,6 +45,7 @@ class Cue(NamedTuple):
     cut_m3: float
     grown_m3: float
     tall: float
+    n_returns: float
 
 
 class Verdict(NamedTuple):
@@ -63,11 +64,12 @@ def cues_of(evidence: Evidence, object_class: ByteArray, regions: Pair[FloatArra
         evidence.n_voxels.after > 0,
         evidence.support.before,
         evidence.support.after,
-        *(getattr(evidence, name) for name in Cue._fields[5:-6]),
+        *(getattr(evidence, name) for name in Cue._fields[5:-7]),
         np.fmax(evidence.n_voxels.before, evidence.n_voxels.after),
         *evidence.volume,
         *regions,
         np.fmax(evidence.height.before, evidence.height.after),
+        np.fmax(evidence.n_points.before, evidence.n_points.after),
     )
     return [
         Cue(ObjectClass(code), *values)
@@ -180,6 +182,11 @@ def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: Ob
             ChangeLabel.UNDETERMINED,
             f"the {other} survey could have seen only {cue.observability:.0%} of it "
             f"(at least {observability.min_observability:.0%} needed){_hidden(cue)}",
+        )
+    if cue.n_returns < params.min_returns:
+        return Verdict(
+            ChangeLabel.UNDETERMINED,
+            f"too little of it to tell: {cue.n_returns:.0f} returns (at least {params.min_returns} needed)",
         )
     if is_apart:
         return Verdict(
