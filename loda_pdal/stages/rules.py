@@ -183,11 +183,6 @@ def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: Ob
             f"the {other} survey could have seen only {cue.observability:.0%} of it "
             f"(at least {observability.min_observability:.0%} needed){_hidden(cue)}",
         )
-    if cue.n_returns < params.min_returns:
-        return Verdict(
-            ChangeLabel.UNDETERMINED,
-            f"too little of it to tell: {cue.n_returns:.0f} returns (at least {params.min_returns} needed)",
-        )
     if is_apart:
         return Verdict(
             label, f"what the {other} survey shows there is another object; it shares {support:.0%} of the surface"
@@ -197,6 +192,11 @@ def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: Ob
         return Verdict(
             ChangeLabel.UNCHANGED,
             f"{support:.0%} of its surface is in the {other} survey too, as part of other objects",
+        )
+    if cue.n_returns < params.min_returns:
+        return Verdict(
+            ChangeLabel.UNDETERMINED,
+            f"too little of it to tell: {cue.n_returns:.0f} returns (at least {params.min_returns} needed)",
         )
     return Verdict(
         label,
