@@ -58,7 +58,12 @@ def _is_seen_through(new: Surface, surfaces: Pair[Surface], parent: IntArray) ->
     member = np.flatnonzero(new.owner >= 0)
     low, high = Groups(new.owner, n).extremes(new.xyz[:, 2])
     shown, other = surfaces
-    owned = np.flatnonzero(other.owner >= 0)
+    is_house = np.zeros(n + 1, np.bool_)
+    is_house[new.owner[member]] = is_house[parent[new.owner[member]]] = True
+    is_house[-1] = False
+    owned = np.flatnonzero(is_house[other.owner])
+    if len(owned) == 0:
+        return np.zeros(n, np.bool_)
     beside, _ = nearest(new.xyz[member], other.xyz[owned], _BEHIND_M)
     wall, part = owned[beside >= 0], new.owner[member[beside[beside >= 0]]]
     height = other.xyz[wall, 2]
