@@ -478,6 +478,13 @@ class ChangeParams(StageParams):
     min_support: float = param(
         0.5, "share of an unmatched object's surface in the other survey that makes it Unchanged", low=0, high=1
     )
+    min_returns: int = param(
+        12,
+        "returns that a survey must have of what the other lacks: stray ones behind a window come and go; fewer are "
+        "Undetermined; 0: any",
+        low=0,
+        high=10000,
+    )
     within_share: float = param(
         0.2,
         "a plant or other object of which the other survey shows less than this share is another one, and what it "
@@ -506,6 +513,11 @@ class ChangeParams(StageParams):
         True,
         "what is solid is gained or lost only where the other survey shows something beneath it and nothing of the "
         "same object above it: else it was hidden",
+    )
+    needs_returns: bool = param(
+        False,
+        "a voxel is gained or lost only where the other survey has a return beneath it, in its column or beside it: a "
+        "wet roof that returned nothing was not taken down",
     )
     fair_tops: bool = param(True, "columns' tops are compared as if both epochs had equally many points in them")
     volume_sigmas: float = param(
@@ -597,7 +609,13 @@ class ChangeParams(StageParams):
 
     def for_bodies(self) -> ChangeParams:
         """The parameters for buildings that are filled."""
-        return replace(self, voxel_m=self.body_voxel_m, query_radius_m=self.body_query_radius_m, weighs_sampling=False)
+        return replace(
+            self,
+            voxel_m=self.body_voxel_m,
+            query_radius_m=self.body_query_radius_m,
+            weighs_sampling=False,
+            needs_returns=True,
+        )
 
 
 @dataclass(frozen=True)
@@ -869,6 +887,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "part_min_width_m": 1.5,
             "plant_width_m": 2.5,
             "needs_sight": False,
+            "min_returns": 8,
             "within_share": 0.0,
             "plant_rise_m": 0.0,
             "fair_tops": False,
@@ -915,6 +934,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "backing_share": 0.0,
             "min_expected_points": 0.0,
             "needs_sight": False,
+            "min_returns": 0,
             "within_share": 0.0,
             "plant_rise_m": 0.0,
             "fair_tops": False,

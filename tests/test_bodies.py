@@ -40,10 +40,15 @@ def surface(parts: list[tuple[int, FloatArray]], bare: FloatArray | None = None)
 GROUND = roof((-10, 50), (-10, 30), 0.0, 0.7)
 
 
-def decide(before: list[tuple[int, FloatArray]], after: list[tuple[int, FloatArray]], *classes: ObjectClass) -> Changes:
+def decide(
+    before: list[tuple[int, FloatArray]],
+    after: list[tuple[int, FloatArray]],
+    *classes: ObjectClass,
+    ground: FloatArray = GROUND,
+) -> Changes:
     """Labels of bodies, as the pipeline asks for them."""
     params = AERIAL.changes.for_bodies()
-    pair = Pair(surface(before, GROUND), surface(after, GROUND)).map(
+    pair = Pair(surface(before, ground), surface(after, ground)).map(
         lambda side: filled_everywhere(side, params.voxel_m)
     )
     cells = np.unique(np.floor(np.concatenate([side.xyz for side in pair])).astype(np.int32), axis=0)
@@ -93,6 +98,21 @@ def test_an_edge_that_was_sampled_once_is_no_change() -> None:
     house, edge = roof((0, 10), (0, 9), 6.0), roof((10, 10.8), (0, 9), 6.0)
     changes = decide([(0, house)], [(0, np.concatenate([house, edge]))], ObjectClass.BUILDING)
     assert [ChangeLabel(c) for c in changes.label] == [ChangeLabel.UNCHANGED]
+
+
+@pytest.mark.parametrize(("is_wet", "expected"), [(True, ["UNCHANGED"]), (False, ["DECREASED"])], ids=["wet", "gone"])
+def test_half_a_roof_that_returned_nothing_is_gone_only_where_the_ground_shows(
+    is_wet: bool, expected: list[str]
+) -> None:
+    house = roof((0, 20), (0, 9), 6.0)
+    half = house[house[:, 0] < 10]
+    is_beneath = (np.abs(GROUND[:, 0] - 15) < 5) & (np.abs(GROUND[:, 1] - 4.5) < 4.5)
+    ground = GROUND[~is_beneath] if is_wet else GROUND
+    for sides in (([(0, house)], [(0, half)]), ([(0, half)], [(0, house)])):
+        changes = decide(*sides, ObjectClass.BUILDING, ground=ground)
+        found = {ChangeLabel(int(c)) for c in changes.label}
+        swapped = [label.swapped.name if sides[0][0][1] is half else label.name for label in found]
+        assert swapped == expected
 
 
 def test_a_house_that_one_survey_shows_as_fragments_has_not_gone() -> None:

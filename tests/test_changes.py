@@ -35,6 +35,13 @@ def block(x: float, y: float, length: float, width: float, top: float) -> tuple[
     return np.concatenate([w[0] for w in walls]) + np.array([x, y, 0.0]), np.concatenate([w[1] for w in walls])
 
 
+def porch(x: float, y: float) -> tuple[FloatArray, FloatArray]:
+    """What a survey shows of a porch against a wall at ``y``: all but its back."""
+    points, normals = block(x, y - 1.5, 2.5, 1.5, 2.75)
+    is_front = points[:, 1] < y
+    return points[is_front], normals[is_front]
+
+
 GROUND = np.stack(np.meshgrid(np.arange(-5.0, 55.0, 0.25), np.arange(-5.0, 30.0, 0.25), [0.0]), -1).reshape(-1, 3)
 
 
@@ -152,22 +159,57 @@ def test_one_house_of_a_terrace_changes_alone() -> None:
 
 
 def test_a_porch_changes_its_house_and_hides_the_wall_behind() -> None:
-    porch = block(2, -1.5, 2.5, 1.5, 2.75)
     inside = (HOUSE[0][:, 0] > 2) & (HOUSE[0][:, 0] < 4.5) & (HOUSE[0][:, 1] == 0) & (HOUSE[0][:, 2] < 2.75)
     hidden = (HOUSE[0][~inside], HOUSE[1][~inside])
-    there = decide(surface((0, HOUSE)), surface((0, joined(hidden, porch))), ObjectClass.BUILDING)
+    there = decide(surface((0, HOUSE)), surface((0, joined(hidden, porch(2, 0)))), ObjectClass.BUILDING)
     assert labels(there) == [ChangeLabel.INCREASED] * 2
     house, part = (0, 1) if there.parent[1] == 0 else (1, 0)
     assert there.parent[part] == house
     assert there.reason[house].startswith("a part of it changed")
     assert np.all(there.owner.before[: len(HOUSE[0])][HOUSE[0][:, 1] > 2] == house)
-    back = decide(surface((0, joined(hidden, porch))), surface((0, HOUSE)), ObjectClass.BUILDING)
+    back = decide(surface((0, joined(hidden, porch(2, 0)))), surface((0, HOUSE)), ObjectClass.BUILDING)
     assert [label.swapped for label in labels(there)] == labels(back)
+
+
+def test_a_wall_that_is_seen_through_what_stands_before_it_is_no_wall_of_an_annex() -> None:
+    """The same porch, but all of the wall behind it is there to be seen still: a scaffold."""
+    scaffold = porch(2, 0)
+    found = decide(surface((0, HOUSE)), surface((0, joined(HOUSE, scaffold))), ObjectClass.BUILDING)
+    house = int(found.owner.before[0])
+    assert labels(found)[house] == ChangeLabel.UNCHANGED
+    assert sorted(labels(found)) == [ChangeLabel.UNCHANGED, ChangeLabel.INCREASED]
+    back = decide(surface((0, joined(HOUSE, scaffold))), surface((0, HOUSE)), ObjectClass.BUILDING)
+    assert [label.swapped for label in labels(found)] == labels(back)
+
+
+def test_a_stem_before_a_house_does_not_change_it() -> None:
+    stem = block(2.05, -0.7, 0.4, 0.4, 5.5)
+    found = decide(surface((0, joined(HOUSE, stem))), surface((0, HOUSE)), ObjectClass.BUILDING)
+    assert labels(found)[int(found.owner.after[0])] == ChangeLabel.UNCHANGED
+
+
+def test_one_of_a_pair_of_houses_is_removed_and_the_other_stays() -> None:
+    neighbour = block(7, 0, 7, 8, 6)
+    house = block(0, 0, 7, 8, 6)
+    found = decide(surface((0, joined(house, neighbour))), surface((0, house)), ObjectClass.BUILDING)
+    assert sorted(labels(found)) == [ChangeLabel.UNCHANGED, ChangeLabel.REMOVED]
+    assert labels(found)[int(found.owner.after[0])] == ChangeLabel.UNCHANGED
+
+
+def test_what_a_few_returns_show_is_undetermined() -> None:
+    thing = block(0, 0, 0.5, 0.5, 1)
+    few = (thing[0][:2], thing[1][:2])
+    assert labels(decide(surface((0, thing)), surface(), ObjectClass.OTHER)) == [ChangeLabel.REMOVED]
+    found = decide(surface((0, few)), surface(), ObjectClass.OTHER)
+    assert labels(found) == [ChangeLabel.UNDETERMINED]
+    assert found.reason == ("too little of it to tell: 10 returns (at least 12 needed)",)
 
 
 def test_a_porch_on_a_row_changes_one_frontage_of_it() -> None:
     row = block(0, 0, 40, 8, 6)
-    found = decide(surface((0, row)), surface((0, joined(row, block(20, -1.5, 2.5, 1.5, 2.75)))), ObjectClass.BUILDING)
+    is_hidden = (np.abs(row[0][:, 0] - 21.25) < 1.25) & (row[0][:, 1] == 0) & (row[0][:, 2] < 2.75)
+    shown = (row[0][~is_hidden], row[1][~is_hidden])
+    found = decide(surface((0, row)), surface((0, joined(shown, porch(20, 0)))), ObjectClass.BUILDING)
     assert sorted(labels(found)) == [ChangeLabel.UNCHANGED, ChangeLabel.INCREASED, ChangeLabel.INCREASED]
     x = row[0][:, 0]
     is_changed = found.label[found.owner.before[: len(x)]] == ChangeLabel.INCREASED
@@ -225,6 +267,44 @@ def test_another_wall_in_the_same_line_is_told_by_its_faces(
     expected = [ChangeLabel.ADDED, ChangeLabel.REMOVED] if is_other else [ChangeLabel.UNCHANGED]
     assert sorted(labels(decide(before, after_side, object_class))) == expected
     assert sorted(labels(decide(after_side, before, object_class))) == expected
+
+
+def test_a_piece_of_a_wall_is_no_other_vehicle() -> None:
+    """Low pieces of two shapes, as in the test above, but under the eaves of a house."""
+    car, higher, house = block(0, 0, 4.5, 1.8, 1.5), block(0, 0, 4.5, 1.8, 1.7), block(-1, -1, 8, 6, 6)
+    found = decide(
+        surface((0, car), (1, house)), surface((0, higher), (1, house)), ObjectClass.MOBILE, ObjectClass.BUILDING
+    )
+    assert labels(found) == [ChangeLabel.UNCHANGED] * 2
+
+
+def test_two_vehicles_in_one_piece_in_one_survey_only_stay_in_their_place() -> None:
+    one, other = block(0, 0, 4.5, 1.8, 1.5), block(5.0, 0.0, 4.5, 1.8, 1.5)
+    found = decide(
+        surface((0, one), (1, other)), surface((0, joined(one, other))), ObjectClass.MOBILE, ObjectClass.VEGETATION
+    )
+    assert set(labels(found)) == {ChangeLabel.UNCHANGED}
+
+
+def bush(seed: int, top: float, spread: float) -> tuple[FloatArray, FloatArray]:
+    """Points of foliage 4 m wide, down to 1 m below tops that scatter by up to ``spread`` about ``top`` m."""
+    rng = np.random.default_rng(seed)
+    plan = np.stack(np.meshgrid(np.arange(0.25, 4, 0.5), np.arange(0.25, 4, 0.5)), -1).reshape(-1, 2)
+    tops = top + rng.uniform(-spread, spread, len(plan))
+    xyz = np.concatenate([np.column_stack([plan, tops - down]) for down in (0.0, 0.4, 0.8)])
+    return xyz, np.tile((0.0, 0.0, 1.0), (len(xyz), 1))
+
+
+@pytest.mark.parametrize(
+    ("spread", "expected"),
+    [(0.05, ChangeLabel.DECREASED), (0.4, ChangeLabel.UNCHANGED)],
+    ids=["cut", "met at other twigs"],
+)
+def test_tops_that_move_alike_moved_and_others_were_met_by_chance(spread: float, expected: ChangeLabel) -> None:
+    there, lower = bush(1, 1.6, spread), bush(2, 1.3, spread)
+    found = decide(surface((0, there)), surface((0, lower)), ObjectClass.VEGETATION)
+    assert found.evidence.column_rise[0] == pytest.approx(-0.3, abs=0.15)
+    assert labels(found) == [expected]
 
 
 def test_vegetation_grows_above_its_own_limit_only() -> None:

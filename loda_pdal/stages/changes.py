@@ -15,10 +15,11 @@ from loda_pdal.model.labels import ChangeLabel, ObjectClass
 from loda_pdal.model.lod_grid import LodGrid
 from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams, ConfidenceParams, ObservabilityParams
+from loda_pdal.stages.annexes import are_built_on
 from loda_pdal.stages.cast import FOLIAGE_M, Cast
 from loda_pdal.stages.confidence import calibrated
 from loda_pdal.stages.correspondence import rank_by_place
-from loda_pdal.stages.cues import Evidence, Surface, Voxels, sample_voxels, weigh
+from loda_pdal.stages.cues import Evidence, Surface, Voxels, median_rise, sample_voxels, share_beneath, weigh
 from loda_pdal.stages.faces import face_offset
 from loda_pdal.stages.observability import Coverage
 from loda_pdal.stages.parts import largest_regions, split_parts
@@ -131,9 +132,9 @@ def decide_changes(
             for cue, v, apart in zip(cues, verdicts, cast.is_apart.tolist(), strict=True)
         ]
     )
-    is_carrier = np.append(cast.is_house, False)[cast.parent] & cast.is_extension
-    is_carrier &= roughness(cast.surfaces, cast.is_extension) < FOLIAGE_M
-    for i, part in changed_houses(verdicts, cast.parent, is_carrier, evidence.dv).items():
+    is_of_house = np.append(cast.is_house, False)[cast.parent] & cast.is_extension
+    is_built_on = are_built_on(cells, cast.surfaces, cast.parent, is_of_house)
+    for i, part in changed_houses(verdicts, cast.parent, is_built_on, evidence.dv).items():
         verdicts[i] = Verdict(verdicts[part].label, f"a part of it changed: {verdicts[part].reason}")
         raw[i] = raw[part]
     sure = [calibrated(score, v.label, confidence) for score, v in zip(raw.tolist(), verdicts, strict=True)]
@@ -159,9 +160,11 @@ def _divided(surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, p
     cells = cast.cells(voxels, params)
     evidence = weigh(cells, cast.surfaces, len(cast), params)
     cues = cues_of(evidence, cast.object_class)
+    is_building = cast.object_class == ObjectClass.BUILDING
     is_inner = np.array([is_within(cue, params) for cue in cues], dtype=np.bool_)
     is_apart = np.array([is_no_pair(cue, params) for cue in cues], dtype=np.bool_) & ~is_inner
-    is_apart |= _is_replaced(cast, cues, voxels.at_points(cells.is_seen.swapped, cast.surfaces), params)
+    is_open = voxels.at_points(cells.is_seen.swapped, cast.surfaces)
+    is_apart |= _is_replaced(cast, cues, voxels, is_open, params) & (share_beneath(cells, is_building) < _MOST_BENEATH)
     if is_apart.any() or is_inner.any():
         cast = cast.without_pairs(is_apart)
         cast = cast.without_surroundings(is_inner, voxels.at_points(cells.is_near.swapped, cast.surfaces))
@@ -182,7 +185,9 @@ def _divided(surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, p
     return cast
 
 
-def _is_replaced(cast: Cast, cues: list[Cue], is_open: Pair[BoolArray], params: ChangeParams) -> BoolArray:
+def _is_replaced(
+    cast: Cast, cues: list[Cue], voxels: Voxels, is_open: Pair[BoolArray], params: ChangeParams
+) -> BoolArray:
     """Which vehicles, walls and fences stand where another one stood."""
     is_pair = np.array([cue.is_before and cue.is_after for cue in cues], dtype=np.bool_)
     is_loose = np.isin(cast.object_class, (ObjectClass.MOBILE, ObjectClass.OTHER)) & is_pair & (params.replaced_m > 0)
@@ -194,7 +199,9 @@ def _is_replaced(cast: Cast, cues: list[Cue], is_open: Pair[BoolArray], params: 
     rough = roughness(cast.surfaces, is_asked)
     is_another |= (off > np.fmax(params.replaced_m, _ROUGH * rough)) & (rough < FOLIAGE_M)
     if params.replaced_top_m > 0:
-        rise = np.array([abs(cue.dh) for cue in cues])
+        rise = np.minimum(
+            [abs(cue.dh) for cue in cues], np.abs(median_rise(voxels, cast.surfaces, len(cast), _LEAST_TOPS))
+        )
         is_mobile = is_pair & (cast.object_class == ObjectClass.MOBILE)
         is_another |= is_mobile & np.isnan(off) & (rise > params.replaced_top_m)
     return np.asarray(is_another)
@@ -209,8 +216,14 @@ def _stands_aside(cast: Cast, cues: list[Cue], is_asked: BoolArray, params: Chan
     return is_off & (roughness(cast.surfaces, is_off) < FOLIAGE_M)
 
 
+_LEAST_TOPS = 4
+"""Columns that both surveys show of a vehicle, before its tops are compared."""
+
 _LEAST_VEHICLE = 50
 """Voxels of a vehicle."""
+
+_MOST_BENEATH = 0.5
+"""Of what is a vehicle no more lies beneath a building: a piece of a wall has more of the house above it."""
 
 _ROUGH = 1.0
 """A shape must be off by more than this many times its own roughness."""

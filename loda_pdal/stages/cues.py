@@ -232,8 +232,9 @@ class Evidence:
     gained, lost
         Voxels that only the after, or only the before epoch has, where the other could have seen them;
         ``gained_above`` and ``lost_above`` are those beyond the other epoch's top.
-    column_rise : m
-        Median change of the top over the columns that both epochs occupy; NaN with fewer than eight of them.
+    column_rise, column_scatter : m
+        Median change of the top over the columns that both epochs occupy, and what lies between the quartiles of these
+        changes; NaN with fewer than eight of them.
     iou, shift : 3D overlap of the occupancy, and distance of the centroids (m).
     dh : m
         Change of the height that the parameters name.
@@ -266,6 +267,7 @@ class Evidence:
     gained_above: FloatArray
     lost_above: FloatArray
     column_rise: FloatArray
+    column_scatter: FloatArray
     lod95: FloatArray
     observability: FloatArray
     hidden: FloatArray
@@ -308,10 +310,15 @@ def sample_voxels(
     over = Pair(always, always)
     if params.needs_sight or params.thing_voxels > 0:
         over = surfaces.map(lambda surface: _is_over(centre, cell, columns, surface.xyz, params.voxel_m))
+    if params.needs_returns:
+        measured = surfaces.map(lambda surface: surface.xyz[surface.n_raw > 0])
+        over = measured.map(lambda points: _is_over(centre, cell, columns, points, params.voxel_m, reach=1))
     if coverage:
         shown = coverage.map(lambda side: side.shown(cell, params.voxel_m))
         hidden = shown.map(lambda rays: rays.is_hidden)
         covered = coverage.join(shown, lambda side, rays: rays.corrected(side.at(centre)))
+        if params.needs_returns:
+            covered = covered.join(over, np.logical_and)
         is_open = coverage.swapped.join(xyz, lambda other, points: other.at(points))
     return Voxels(
         cell=cell,
@@ -359,15 +366,22 @@ def cells_with_owners(
     return Cells(voxels, owner, is_seen, n_raw.map(lambda points: points > 0), odds)
 
 
-def _is_over(centre: FloatArray, cell: Int64Array, columns: Int64Array, xyz: FloatArray, voxel_m: float) -> BoolArray:
-    """Whether any of the points (m, 3) lies in the column of each voxel (c,), beneath its centre."""
+def _is_over(
+    centre: FloatArray, cell: Int64Array, columns: Int64Array, xyz: FloatArray, voxel_m: float, reach: int = 0
+) -> BoolArray:
+    """Whether any of the points (m, 3) lies beneath the centre of each voxel (c,), in its column or at most ``reach``
+    columns beside it."""
     first = columns[:-1]
     if len(first) == 0 or len(xyz) == 0:
         return np.zeros(len(cell), np.bool_)
     plan = cell[first, :2]
     lattice = Lattice.around(plan)
-    column = lattice.find(lattice.keys(plan), cells_of(xyz[:, :2], voxel_m))
-    lowest = np.fmin(Groups(column, len(first)).minimum(xyz[:, 2]), np.inf)
+    keys = lattice.keys(plan)
+    lowest = np.full(len(first), np.inf)
+    place = cells_of(xyz[:, :2], voxel_m)
+    for step in np.ndindex(2 * reach + 1, 2 * reach + 1):
+        column = lattice.find(keys, place + (np.array(step) - reach))
+        lowest = np.fmin(lowest, Groups(column, len(first)).minimum(xyz[:, 2]))
     return np.asarray(np.repeat(lowest, np.diff(columns)) < centre[:, 2])
 
 
@@ -385,6 +399,21 @@ def _is_beneath(voxels: Voxels, owner: IntArray, other: IntArray) -> BoolArray:
         return np.zeros(len(owner), np.bool_)
     is_found = (keys[place] == column * n + owner) & (owner >= 0)
     return np.asarray(is_found & (voxels.cell[highest[place], 2] >= voxels.cell[:, 2]))
+
+
+def share_beneath(cells: Cells, is_roof: BoolArray) -> FloatArray:
+    """Share (n,) of each object's voxels that lie beneath one of the objects ``is_roof`` (n,) in either epoch."""
+    voxels, n = cells.voxels, len(is_roof)
+    if len(voxels) == 0:
+        return np.zeros(n)
+    is_held = cells.owner.map(lambda side: np.append(is_roof, False)[side])
+    z = voxels.cell[:, 2]
+    low = z.min() - 1
+    top = np.maximum.reduceat(np.where(is_held.before | is_held.after, z, low), voxels.columns[:-1])
+    is_beneath = z < np.repeat(top, np.diff(voxels.columns))
+    voxel, owner = _either(cells)
+    held = np.bincount(owner, minlength=n)
+    return np.bincount(owner, weights=is_beneath[voxel], minlength=n) / np.maximum(held, 1)
 
 
 def _slots(cells: Pair[Int64Array]) -> tuple[Int64Array, Int64Array, Int64Array, Int64Array]:
@@ -461,6 +490,9 @@ def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -
     columns = _column_tops(voxels, surfaces, n)
     summit = columns.top.map(lambda top: _summit(columns.owner, top, n))
     top = height if params.height_reference == "ground" else summit
+    column_rise, column_scatter = _rise_of_columns(
+        _fair_rises(voxels, surfaces, n) if params.fair_tops else columns.rises, n, _LEAST_COLUMNS
+    )
     z = voxels.centre[:, 2]
     centroid = own.join(is_known, lambda side, known: Groups(np.where(known, side, -1), n).mean(voxels.centre))
     return Evidence(
@@ -480,7 +512,8 @@ def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -
         d_typical=np.where(is_sampled, samples.median(np.abs(displacement)), np.nan),
         gained_above=_count(own.after, cells.is_gained & _is_above(z, own.after, summit.before), n, cells.odds.before),
         lost_above=_count(own.before, cells.is_lost & _is_above(z, own.before, summit.after), n, cells.odds.after),
-        column_rise=_median_rise(_fair_rises(voxels, surfaces, n) if params.fair_tops else columns.rises, n),
+        column_rise=column_rise,
+        column_scatter=column_scatter,
         lod95=Groups(owner, n).median(voxels.lod95[voxel]),
         observability=(n_known.before + n_known.after) / np.maximum(n_voxels.before + n_voxels.after, 1),
         hidden=(n_hidden.before + n_hidden.after) / np.maximum(n_voxels.before + n_voxels.after, 1),
@@ -567,16 +600,25 @@ def _column_tops(voxels: Voxels, surfaces: Pair[Surface], n: int) -> _Columns:
     return _Columns(owner[is_column], Pair(*np.ascontiguousarray(top[is_column].T)))
 
 
+def median_rise(voxels: Voxels, surfaces: Pair[Surface], n: int, least: int) -> FloatArray:
+    """How far the tops of each object (n,) rise, m, in the median of the columns that both epochs have of it; NaN with
+    fewer than ``least`` of these."""
+    return _rise_of_columns(_column_tops(voxels, surfaces, n).rises, n, least)[0]
+
+
 def _summit(owner: IntArray, top: FloatArray, n: int) -> FloatArray:
     """95th percentile (n,) m of the tops of each object's columns."""
     is_known = np.isfinite(top)
     return Groups(owner[is_known], n).quantile(top[is_known], 0.95)
 
 
-def _median_rise(rises: tuple[IntArray, FloatArray], n: int) -> FloatArray:
-    """Median change of the columns' tops (n,) m over the columns that both epochs have."""
+def _rise_of_columns(rises: tuple[IntArray, FloatArray], n: int, least: int) -> tuple[FloatArray, FloatArray]:
+    """Median change of the columns' tops (n,) m over the columns that both epochs have, and the distance (n,) m of the
+    quartiles; NaN with fewer than ``least`` columns."""
     groups = Groups(rises[0], n)
-    return np.where(groups.counts >= _LEAST_COLUMNS, groups.median(rises[1]), np.nan)
+    is_told = groups.counts >= least
+    scatter = groups.quantile(rises[1], 0.75) - groups.quantile(rises[1], 0.25)
+    return np.where(is_told, groups.median(rises[1]), np.nan), np.where(is_told, scatter, np.nan)
 
 
 _LEAST_COLUMNS = 8

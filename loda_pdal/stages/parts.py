@@ -27,6 +27,12 @@ _LINK_VOXELS = 2.9
 _MOST_OF = 0.5
 """A region that takes more than this share of an object's columns is no part of it: the object itself changed."""
 
+_MOST_OF_HOUSE = 1 / 3
+"""What takes more than this share of the columns, and is new in them, is no annex but half of a pair of houses."""
+
+_LEAST_ANNEX_M = 1.0
+"""What is built onto a house is longer: a drainpipe, or the stem of a tree that leans over the roof, is no annex."""
+
 _WIDE = 0.6
 """Storeys wider than this many frontages are those of a house of their own."""
 
@@ -270,7 +276,8 @@ def _claim(
         first, last = start[region.parent], start[region.parent + 1]
         is_inside = _under(region.columns, rows[first:last, 1:], fills_hull=not params.fills_buildings)
         is_in_row = has_houses[region.parent] and is_long[region.parent]
-        is_new = is_in_row and region.share_new > 0.5
+        is_large = is_in_row or np.count_nonzero(is_inside) > _MOST_OF_HOUSE * (last - first)
+        is_new = has_houses[region.parent] and is_large and region.share_new > 0.5
         is_new = is_new and region.n_voxels * params.voxel_m**3 > params.part_is_new_m3
         most_of = 1.0 if is_new or is_plant[region.parent] else _MOST_OF_ROW if is_in_row else _MOST_OF
         if np.count_nonzero(is_inside) > most_of * (last - first):
@@ -279,7 +286,8 @@ def _claim(
         if is_free.any():
             width_m = float((np.ptp(region.columns, axis=0) + 1).max()) * params.voxel_m
             is_storey = region.share_new < 0.5 and width_m > _WIDE * params.frontage_m
-            is_extension.append(bool(has_houses[region.parent]) and not is_new and not is_storey)
+            is_annex = width_m > _LEAST_ANNEX_M and not is_new and not is_storey
+            is_extension.append(bool(has_houses[region.parent]) and is_annex)
             if is_in_row and is_extension[-1]:
                 in_rows.append((len(parents), region))
             part_of[first:last][is_free] = len(parents)

@@ -34,6 +34,7 @@ class Cue(NamedTuple):
     gained_above: float
     lost_above: float
     column_rise: float
+    column_scatter: float
     lod95: float
     observability: float
     hidden: float
@@ -44,6 +45,7 @@ class Cue(NamedTuple):
     cut_m3: float
     grown_m3: float
     tall: float
+    n_returns: float
 
 
 class Verdict(NamedTuple):
@@ -62,11 +64,12 @@ def cues_of(evidence: Evidence, object_class: ByteArray, regions: Pair[FloatArra
         evidence.n_voxels.after > 0,
         evidence.support.before,
         evidence.support.after,
-        *(getattr(evidence, name) for name in Cue._fields[5:-6]),
+        *(getattr(evidence, name) for name in Cue._fields[5:-7]),
         np.fmax(evidence.n_voxels.before, evidence.n_voxels.after),
         *evidence.volume,
         *regions,
         np.fmax(evidence.height.before, evidence.height.after),
+        np.fmax(evidence.n_points.before, evidence.n_points.after),
     )
     return [
         Cue(ObjectClass(code), *values)
@@ -190,6 +193,11 @@ def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: Ob
             ChangeLabel.UNCHANGED,
             f"{support:.0%} of its surface is in the {other} survey too, as part of other objects",
         )
+    if cue.n_returns < params.min_returns:
+        return Verdict(
+            ChangeLabel.UNDETERMINED,
+            f"too little of it to tell: {cue.n_returns:.0f} returns (at least {params.min_returns} needed)",
+        )
     return Verdict(
         label,
         f"no match in the {other} survey, which shows {support:.0%} of its surface "
@@ -209,7 +217,8 @@ _LEAST_EMPTY = 0.2
 def _mobile(cue: Cue, params: ChangeParams) -> Verdict:
     """Matched mobile objects (paper, section 4.3): the same in its place, or the epoch with more of its own space."""
     figures = f"overlap {cue.iou:.2f}, centre moved {cue.shift:.2f} m"
-    if cue.iou > params.mobile_iou and cue.shift < params.mobile_shift_m:
+    is_near = cue.shift < params.mobile_shift_m or cue.iou >= params.min_support
+    if cue.iou > params.mobile_iou and is_near:
         return Verdict(
             ChangeLabel.UNCHANGED, f"in its place: {figures} (limits {params.mobile_iou} and {params.mobile_shift_m} m)"
         )
@@ -228,6 +237,7 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
     least = params.backing_voxels
     least_above = max(least, params.backing_share * cue.n_voxels)
     dh = cue.dh
+    is_alike = cue.column_scatter <= _ALIKE * abs(cue.column_rise)  # twigs that were met by chance do not move alike
     if params.fills_buildings and cue.object_class == ObjectClass.BUILDING and abs(cue.column_rise) > abs(dh):
         dh = cue.column_rise  # most of the roof moved, if not its highest part
     has_height = params.use_height and abs(dh) > max(gate, height_m)  # NaN is never above
@@ -236,9 +246,10 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
         # edges of roofs come and go with the sampling: a body changed where a piece of it did, or most of its roof
         is_solid = max(cue.grown_m3, cue.cut_m3) > 0
         has_volume &= is_solid
-        has_height &= is_solid or abs(cue.column_rise) > max(gate, height_m)
+        has_height &= is_solid or (is_alike and abs(cue.column_rise) > max(gate, height_m))
     # a top that moves by more than what hides a voxel leaves voxels behind
-    rise = cue.column_rise if not params.needs_sight or abs(cue.dh) < _HIDES_VOXEL * params.query_radius_m else math.nan
+    is_hideable = not params.needs_sight or abs(cue.dh) < _HIDES_VOXEL * params.query_radius_m
+    rise = cue.column_rise if is_hideable and is_alike else math.nan
     is_crown = params.needs_sight and is_green and cue.tall >= _LOW_M
     enough = max(gate, height_m if is_crown else height_m / 2)
     is_raised = least == 0 or cue.gained_above >= least_above or rise > enough
@@ -246,7 +257,7 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
     rises = has_height and dh > 0 and is_raised
     sinks = has_height and dh < 0 and is_lowered
     is_low = is_green and cue.tall < _LOW_M
-    if params.plant_rise_m > 0 and is_low and abs(cue.column_rise) < _HIDES_VOXEL * params.query_radius_m:
+    if params.plant_rise_m > 0 and is_low and is_alike and abs(cue.column_rise) < _HIDES_VOXEL * params.query_radius_m:
         rises |= cue.column_rise > max(gate, params.plant_rise_m)
         sinks |= cue.column_rise < -max(gate, params.plant_rise_m)
     noise = params.volume_sigmas * math.sqrt(cue.gained + cue.lost)
@@ -282,6 +293,9 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
 
 _LOW_M = 3.0
 """Plants up to here have a top of their own, and no crown that sheds its leaves."""
+
+_ALIKE = 1.2
+"""Tops of columns move alike where the quartiles of their moves lie no farther apart than so many times the median."""
 
 _HIDES_VOXEL = 1.5
 """Query radii that a top may move without a voxel gained or lost."""

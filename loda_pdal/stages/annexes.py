@@ -1,0 +1,75 @@
+"""What was built onto a house and changes it, and what only stands before it (METHOD 2b).
+
+An annex is as smooth as a wall, and hides the wall behind it. A scaffold, a stall or a tree over the roof does not: the
+wall is seen through it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from loda_pdal.kernels.neighbours import nearest
+from loda_pdal.model.cloud import BoolArray, IntArray
+from loda_pdal.model.groups import Groups
+from loda_pdal.model.pair import Pair
+from loda_pdal.stages.cast import FOLIAGE_M
+from loda_pdal.stages.cues import Cells, Surface
+from loda_pdal.stages.vehicles import roughness
+
+_SAME_M = 0.2
+"""Points so close to each other lie on one wall, fused to 0.25 m."""
+
+_BEHIND_M = 1.0
+"""The wall behind begins no farther from what stands before it."""
+
+_LEAST_BEHIND = 12
+"""Points of the wall behind that tell whether it is still to be seen."""
+
+_STILL_SEEN = 0.9
+"""Share of them that one still sees through what stands before the wall."""
+
+
+def are_built_on(cells: Cells, surfaces: Pair[Surface], parent: IntArray, is_asked: BoolArray) -> BoolArray:
+    """Which of the parts of houses ``is_asked`` (n,) are solid: what came or went of them is smooth and hid the wall.
+
+    Parameters
+    ----------
+    cells : Cells
+        Voxels with their owners, the parts among them.
+    surfaces : Pair of Surface
+        Points with their objects, 0 to ``n - 1``.
+    parent : (n,) int32
+        The house of each part.
+    """
+    came_or_went = cells.voxels.at_points(Pair(cells.is_lost, cells.is_gained), surfaces)
+    new = surfaces.join(came_or_went, lambda side, is_new: side.only(is_new & np.append(is_asked, False)[side.owner]))
+    is_smooth = roughness(new, is_asked) < FOLIAGE_M
+    is_open = _is_seen_through(new.before, surfaces, parent) | _is_seen_through(new.after, surfaces.swapped, parent)
+    return np.asarray(is_asked & is_smooth & ~is_open)
+
+
+def _is_seen_through(new: Surface, surfaces: Pair[Surface], parent: IntArray) -> BoolArray:
+    """Whether an epoch that shows ``new`` points of parts (n,) shows all the same the walls of their houses that the
+    other epoch shows beside these points.
+
+    ``surfaces`` of this epoch and of the other.
+    """
+    n = len(parent)
+    member = np.flatnonzero(new.owner >= 0)
+    low, high = Groups(new.owner, n).extremes(new.xyz[:, 2])
+    shown, other = surfaces
+    is_house = np.zeros(n + 1, np.bool_)
+    is_house[new.owner[member]] = is_house[parent[new.owner[member]]] = True
+    is_house[-1] = False
+    owned = np.flatnonzero(is_house[other.owner])
+    if len(owned) == 0:
+        return np.zeros(n, np.bool_)
+    beside, _ = nearest(new.xyz[member], other.xyz[owned], _BEHIND_M)
+    wall, part = owned[beside >= 0], new.owner[member[beside[beside >= 0]]]
+    height = other.xyz[wall, 2]
+    is_its = (other.owner[wall] == part) | (other.owner[wall] == parent[part])
+    is_behind = is_its & (height >= low[part]) & (height <= high[part])
+    wall, part = wall[is_behind], part[is_behind]
+    still, _ = nearest(shown.xyz[shown.owner >= 0], other.xyz[wall], _SAME_M)
+    counts = np.bincount(part, minlength=n)
+    return np.asarray((counts >= _LEAST_BEHIND) & (np.bincount(part[still >= 0], minlength=n) >= _STILL_SEEN * counts))
