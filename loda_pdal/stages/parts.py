@@ -270,7 +270,7 @@ def _claim(
         first, last = start[region.parent], start[region.parent + 1]
         is_inside = _under(region.columns, rows[first:last, 1:], fills_hull=not params.fills_buildings)
         is_in_row = has_houses[region.parent] and is_long[region.parent]
-        is_new = is_in_row and region.share_new > 0.5
+        is_new = bool(has_houses[region.parent]) and region.share_new > 0.5
         is_new = is_new and region.n_voxels * params.voxel_m**3 > params.part_is_new_m3
         most_of = 1.0 if is_new or is_plant[region.parent] else _MOST_OF_ROW if is_in_row else _MOST_OF
         if np.count_nonzero(is_inside) > most_of * (last - first):
