@@ -458,7 +458,7 @@ class ChangeParams(StageParams):
         low=0,
         high=100,
     )
-    vegetation_volume_ratio: float = param(0.18, "relative volume change of vegetation", low=0, high=10)
+    vegetation_volume_ratio: float = param(0.25, "relative volume change of vegetation", low=0, high=10)
     mobile_iou: float = param(0.20, "IoU of an unchanged mobile object", low=0, high=1)
     mobile_shift_m: float = param(
         2.0, "largest centroid shift of an unchanged mobile object", unit="m", low=0, high=100
@@ -499,8 +499,9 @@ class ChangeParams(StageParams):
         0.02, "share of the object's voxels that must back a height cue, beyond the other epoch's top", low=0, high=1
     )
     min_expected_points: float = param(
-        3.0,
-        "a voxel is empty only where the sampling let this many raw points be expected; 0: always",
+        6.0,
+        "a voxel is empty only where the sampling let this many raw points of the object be expected in it and in the "
+        "voxels beside it; 0: always",
         low=0,
         high=1000,
     )
@@ -883,6 +884,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "replaced_top_m": 0.2,
             "backing_voxels": 4,
             "vegetation_height_m": 0.8,
+            "vegetation_volume_ratio": 0.18,
             "fills_buildings": True,
             "part_min_width_m": 1.5,
             "plant_width_m": 2.5,
@@ -929,6 +931,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "displacement_m": 0.0,
             "height_reference": "ground",
             "volume_reference": "before",
+            "vegetation_volume_ratio": 0.18,
             "min_support": 1.0,
             "backing_voxels": 0,
             "backing_share": 0.0,

@@ -205,6 +205,46 @@ def test_what_a_few_returns_show_is_undetermined() -> None:
     assert found.reason == ("too little of it to tell: 10 returns (at least 12 needed)",)
 
 
+def scaffold(x: float, y: float, length: float, top: float) -> tuple[FloatArray, FloatArray]:
+    """Decks every 2 m and poles every 2.5 m, 1 m deep: the wall behind shows between them."""
+    decks = np.arange(2.0, top + 0.1, 2.0)
+    deck = np.stack(np.meshgrid(np.arange(0.125, length, 0.25), np.arange(0.0, 1.1, 0.25), decks), -1).reshape(-1, 3)
+    pole = np.stack(np.meshgrid(np.arange(0.125, length, 2.5), [0.0], np.arange(0.125, top, 0.25)), -1).reshape(-1, 3)
+    normals = np.repeat([[0, 0, 1], [0, -1, 0]], [len(deck), len(pole)], axis=0)
+    return np.concatenate([deck, pole]) + np.array([x, y, 0.0]), normals
+
+
+def test_scaffolding_before_a_wall_that_shows_behind_it_is_no_growth_of_the_house() -> None:
+    before, after = surface((0, HOUSE)), surface((0, joined(HOUSE, scaffold(1, -1.5, 7, 6))))
+    found = decide(before, after, ObjectClass.BUILDING)
+    assert sorted(labels(found)) == [ChangeLabel.UNCHANGED, ChangeLabel.ADDED]
+    part = labels(found).index(ChangeLabel.ADDED)
+    assert found.reason[part].startswith("the wall behind it shows as before")
+    assert labels(found)[found.parent[part]] == ChangeLabel.UNCHANGED
+    back = decide(after, before, ObjectClass.BUILDING)
+    assert [label.swapped for label in labels(found)] == labels(back)
+
+
+def test_as_wide_an_extension_that_hides_the_wall_is_growth() -> None:
+    wing = block(1, -1.5, 7, 1.5, 3.0)
+    is_back = (wing[0][:, 1] == 0) & (wing[1][:, 1] == 1)
+    wing = wing[0][~is_back], wing[1][~is_back]
+    is_hidden = (HOUSE[0][:, 0] > 1) & (HOUSE[0][:, 0] < 8) & (HOUSE[0][:, 1] == 0) & (HOUSE[0][:, 2] < 3)
+    rest = HOUSE[0][~is_hidden], HOUSE[1][~is_hidden]
+    found = decide(surface((0, HOUSE)), surface((0, joined(rest, wing))), ObjectClass.BUILDING)
+    assert set(labels(found)) == {ChangeLabel.INCREASED}
+
+
+def test_of_two_houses_that_touch_one_is_removed_and_the_other_stays() -> None:
+    one, other = block(0, 0, 6, 7, 6), block(6, 0, 6, 7, 6)
+    before, after = surface((0, joined(one, other))), surface((0, one))
+    found = decide(before, after, ObjectClass.BUILDING)
+    assert sorted(labels(found)) == [ChangeLabel.UNCHANGED, ChangeLabel.REMOVED]
+    gone = labels(found).index(ChangeLabel.REMOVED)
+    assert before.xyz[found.owner.before == gone, 0].min() > 5.0
+    assert [label.swapped for label in labels(found)] == labels(decide(after, before, ObjectClass.BUILDING))
+
+
 def test_a_porch_on_a_row_changes_one_frontage_of_it() -> None:
     row = block(0, 0, 40, 8, 6)
     is_hidden = (np.abs(row[0][:, 0] - 21.25) < 1.25) & (row[0][:, 1] == 0) & (row[0][:, 2] < 2.75)

@@ -121,3 +121,25 @@ def test_tops_and_rise_of_the_columns_as_a_loop_finds_them(
         shared = [c for c in heights.before if c[0] == o and c in heights.after]
         mean = [np.mean([z for c in shared for z in height[c]]) if shared else np.nan for height in heights]
         assert evidence.rise[o] == pytest.approx(mean[1] - mean[0], nan_ok=True)
+
+
+def test_a_sparse_wall_that_rose_is_gained_though_no_voxel_of_it_has_many_points() -> None:
+    """A wall of two points to the voxel, 4 m and then 6 m high, and one new voxel of two points far from it."""
+
+    def wall(n_high: int, more: list[list[float]]) -> Surface:
+        i, k = np.meshgrid(np.arange(12), np.arange(n_high), indexing="ij")
+        centre = np.column_stack([0.5 * i.ravel() + 0.25, np.full(i.size, 0.25), 0.5 * k.ravel() + 0.25])
+        xyz = np.concatenate([centre, np.array(more, dtype=np.float64).reshape(-1, 3)])
+        normals = np.tile(np.array([0, 1, 0], np.float32), (len(xyz), 1))
+        owner = np.zeros(len(xyz), np.int32)
+        return Surface(xyz, normals, xyz[:, 2], np.full(len(xyz), 2, np.int32), owner, owner >= 0)
+
+    lone = [10.25, 0.25, 3.25]
+    surfaces = Pair(wall(8, []), wall(12, [lone]))
+    for least, expected in ((0.0, 12 * 3 + 1), (6.0, 12 * 3), (12.0, 0)):
+        params = ChangeParams(min_expected_points=least)
+        voxels = sample_voxels(surfaces, None, NO_LIMITS, params)
+        cells = cells_with_owners(voxels, surfaces, 1, params)
+        # the lowest row of the new voxels is within reach of the old wall's top
+        assert np.count_nonzero(cells.is_gained) == expected
+        assert not cells.is_lost.any()

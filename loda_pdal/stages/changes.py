@@ -22,7 +22,7 @@ from loda_pdal.stages.correspondence import rank_by_place
 from loda_pdal.stages.cues import Evidence, Surface, Voxels, median_rise, sample_voxels, share_beneath, weigh
 from loda_pdal.stages.faces import face_offset
 from loda_pdal.stages.observability import Coverage
-from loda_pdal.stages.parts import largest_regions, split_parts
+from loda_pdal.stages.parts import largest_regions, screens, split_parts
 from loda_pdal.stages.rules import (
     Cue,
     Verdict,
@@ -32,6 +32,7 @@ from loda_pdal.stages.rules import (
     is_no_pair,
     is_within,
     raw_score,
+    screen,
     verdict_of,
 )
 from loda_pdal.stages.things import split_things
@@ -124,15 +125,16 @@ def decide_changes(
         verdict_of(cue, apart, part, params, observability)
         for cue, apart, part in zip(cues, cast.is_apart.tolist(), is_part.tolist(), strict=True)
     ]
+    is_screen = screens(cells, cast.object_class == ObjectClass.BUILDING, cast.is_extension)
     for i in np.flatnonzero(cast.is_extension).tolist():
-        verdicts[i] = extension(verdicts[i])
+        verdicts[i] = screen(verdicts[i]) if is_screen[i] else extension(verdicts[i])
     raw = np.array(
         [
             raw_score(cue, v, apart, params, confidence)
             for cue, v, apart in zip(cues, verdicts, cast.is_apart.tolist(), strict=True)
         ]
     )
-    is_of_house = np.append(cast.is_house, False)[cast.parent] & cast.is_extension
+    is_of_house = np.append(cast.is_house, False)[cast.parent] & cast.is_extension & ~is_screen
     is_built_on = are_built_on(cells, cast.surfaces, cast.parent, is_of_house)
     for i, part in changed_houses(verdicts, cast.parent, is_built_on, evidence.dv).items():
         verdicts[i] = Verdict(verdicts[part].label, f"a part of it changed: {verdicts[part].reason}")

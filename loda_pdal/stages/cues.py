@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -114,6 +115,16 @@ class Voxels:
 
     def __len__(self) -> int:
         return len(self.cell)
+
+    @cached_property
+    def beside(self) -> Int64Array:
+        """The voxels (c, 6) that share a face with each, -1 where there is none."""
+        if len(self) == 0:
+            return np.zeros((0, 6), dtype=np.int64)
+        lattice = Lattice.around(self.cell)
+        keys = lattice.keys(self.cell)
+        steps = np.concatenate([np.eye(3, dtype=np.int64), -np.eye(3, dtype=np.int64)])
+        return np.column_stack([lattice.find(keys, self.cell + step) for step in steps])
 
     def holders(self, surfaces: Pair[Surface], n: int) -> tuple[IntArray, FloatArray]:
         """Object (c, 2) that has each voxel before and after, -1 none, and its raw points (c, 2) in there.
@@ -349,12 +360,12 @@ def cells_with_owners(
     owner, n_raw = (Pair(*np.ascontiguousarray(values.T)) for values in (holder, points))
     is_seen = voxels.is_covered
     odds = n_raw.map(np.ones_like)
-    if params.min_expected_points > 0 or params.weighs_sampling:
-        expected = _expected_points(owner, n_raw, n)
-        if params.min_expected_points > 0:
-            is_seen = is_seen.join(expected, lambda seen, points: seen & (points >= params.min_expected_points))
-        if params.weighs_sampling:
-            odds = expected.map(lambda points: 1.0 - np.exp(-points))
+    if params.min_expected_points > 0:
+        within = owner.join(n_raw, lambda side, points: _with_beside(voxels.beside, side, points))
+        expected = _expected_points(owner, n_raw, within, n)
+        is_seen = is_seen.join(expected, lambda seen, points: seen & (points >= params.min_expected_points))
+    if params.weighs_sampling:
+        odds = _expected_points(owner, n_raw, n_raw, n).map(lambda points: 1.0 - np.exp(-points))
     if is_solid is not None and is_solid.any():
         own = owner.swapped  # what each epoch should have seen is the other's
         is_hidden = Pair(
@@ -433,18 +444,27 @@ def _slots(cells: Pair[Int64Array]) -> tuple[Int64Array, Int64Array, Int64Array,
     return cell, np.concatenate([[0], np.flatnonzero(is_column) + 1, [len(cell)]]), order, starts
 
 
-def _expected_points(owner: Pair[IntArray], n_raw: Pair[FloatArray], n: int) -> Pair[FloatArray]:
-    """Raw points (c,) that each epoch should have in a voxel that the other occupies, were the object unchanged.
+def _with_beside(beside: Int64Array, owner: IntArray, n_raw: FloatArray) -> FloatArray:
+    """Raw points (c,) of each voxel's owner in the voxel and in those ``beside`` (c, 6) it: what lies within reach of
+    its centre, where a surface must be missing for the voxel to be empty."""
+    is_own = np.append(owner, -1)[beside] == owner[:, None]
+    return np.asarray(n_raw + (np.append(n_raw, 0.0)[beside] * is_own).sum(axis=1))
 
-    From the other epoch's points there and the ratio of both epochs' points in the voxels of the object that both
-    occupy; an object without such voxels is expected to be sampled alike by both.
+
+def _expected_points(
+    owner: Pair[IntArray], n_raw: Pair[FloatArray], n_there: Pair[FloatArray], n: int
+) -> Pair[FloatArray]:
+    """Raw points (c,) that each epoch should have where the other has ``n_there`` of an object, were it unchanged.
+
+    By the ratio of both epochs' points ``n_raw`` in the voxels of the object that both occupy; an object without such
+    voxels is expected to be sampled alike by both.
     """
     is_both = (owner.before >= 0) & (owner.before == owner.after)
     shared = n_raw.map(lambda points: np.bincount(owner.before[is_both], weights=points[is_both], minlength=n) + 1.0)
     ratio = np.append(shared.before / shared.after, 1.0)
     return Pair(
-        np.where(owner.after >= 0, n_raw.after * ratio[owner.after], np.inf),
-        np.where(owner.before >= 0, n_raw.before / ratio[owner.before], np.inf),
+        np.where(owner.after >= 0, n_there.after * ratio[owner.after], np.inf),
+        np.where(owner.before >= 0, n_there.before / ratio[owner.before], np.inf),
     )
 
 

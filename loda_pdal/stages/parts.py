@@ -27,14 +27,11 @@ _LINK_VOXELS = 2.9
 _MOST_OF = 0.5
 """A region that takes more than this share of an object's columns is no part of it: the object itself changed."""
 
-_MOST_OF_HOUSE = 1 / 3
-"""What takes more than this share of the columns, and is new in them, is no annex but half of a pair of houses."""
-
 _LEAST_ANNEX_M = 1.0
 """What is built onto a house is longer: a drainpipe, or the stem of a tree that leans over the roof, is no annex."""
 
 _WIDE = 0.6
-"""Storeys wider than this many frontages are those of a house of their own."""
+"""Storeys wider than this many frontages are those of a house of their own, and so is what is as wide either way."""
 
 _MOST_OF_ROW = 0.75
 """The same for a row of houses: two of three may have a new storey."""
@@ -86,9 +83,9 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, 
     Other objects shorter than ``part_of_length_m`` that both epochs have stay whole, and so does an object of which a
     region takes most columns, unless that is a new house.
 
-    A building up to that length is one house. What changed of a longer one is part of a
-    house in a row: ``frontage_m`` of the row about it are taken out too, as the house that it is a part of. Bodies
-    beside other bodies are looked through whatever their length: where one house of a row ends is not certain.
+    A building up to that length is one house, or two of which one came or went. What changed of a longer one is part
+    of a house in a row: ``frontage_m`` of the row about it are taken out too, as the house that it is a part of.
+    Bodies beside other bodies are looked through whatever their length: where one house of a row ends is not certain.
 
     Plants grow together: where a piece of a plant, ``plant_width_m`` wide, stands on what the other survey saw bare, it
     is a plant of its own, and not a growth of its neighbour.
@@ -158,6 +155,51 @@ def largest_regions(cells: Cells, n: int, params: ChangeParams) -> Pair[FloatArr
         return volume
 
     return Pair(largest(cells.owner, cells.is_lost), largest(cells.owner.swapped, cells.is_gained))
+
+
+def screens(cells: Cells, is_wall: BoolArray, is_asked: BoolArray) -> BoolArray:
+    """Which of the objects asked for (n,) stand before walls and hide nothing of them: scaffolding, say.
+
+    What is built onto a house takes the wall behind it out of sight. Where the epoch that has the object shows the wall
+    behind it all the same, as the other epoch does, rays pass through, and the house is what it was.
+
+    Parameters
+    ----------
+    cells : Cells
+        Voxels with their owners.
+    is_wall : (n,) bool
+        Objects that walls may belong to.
+    is_asked : (n,) bool
+        Objects that came or went before one.
+    """
+    voxels, n = cells.voxels, len(is_asked)
+    asked, wall = np.append(is_asked, False), np.append(is_wall, False)
+    found = np.zeros(n, np.bool_)
+    for own, other, near, is_new in (
+        (cells.owner.before, cells.owner.after, cells.is_near.before, cells.is_lost),
+        (cells.owner.after, cells.owner.before, cells.is_near.after, cells.is_gained),
+    ):
+        label = np.where(is_new & asked[own], own, -1)
+        boxes = upright_boxes(voxels.centre, label, n)
+        for i in np.unique(label[label >= 0]).tolist():
+            reach = boxes.size[i] / 2 + [0.0, _BEHIND_M, 0.0]
+            half = float(np.hypot(reach[0], reach[1]))
+            first, last = np.searchsorted(voxels.centre[:, 0], boxes.centre[i, 0] + np.array([-half, half]))
+            offset = (voxels.centre[first:last] - boxes.centre[i]) @ boxes.axes[i].T
+            is_behind = np.all(np.abs(offset) <= reach, axis=1) & wall[other[first:last]]
+            shown = near[first:last][is_behind]
+            found[i] |= len(shown) >= _LEAST_WALL and float(shown.mean()) >= _SEEN_THROUGH
+    return found
+
+
+_BEHIND_M = 1.5
+"""A wall this far behind what stands before it is looked for."""
+
+_LEAST_WALL = 60
+"""Voxels of a wall that must be known: what is small hides little of it whatever it is."""
+
+_SEEN_THROUGH = 0.95
+"""Share of them that show."""
 
 
 def dissolve(owner: Pair[IntArray], is_dissolved: BoolArray, n: int) -> tuple[Pair[IntArray], IntArray]:
@@ -245,6 +287,12 @@ def width_of(columns: Int64Array) -> float:
     return float(2.0 * ndimage.distance_transform_edt(plan).max() - 1.0)
 
 
+def _least_side(columns: Int64Array) -> float:
+    """The shorter side of the smallest rectangle about the columns (k, 2), in cells."""
+    plan = np.column_stack([columns, np.zeros(len(columns))]).astype(np.float64)
+    return float(upright_boxes(plan, np.zeros(len(plan), np.int32), 1).size[0, 1])
+
+
 def _under(region: Int64Array, columns: Int64Array, *, fills_hull: bool) -> BoolArray:
     """Which columns (k, 2) lie under a region: inside its hull where rays leave gaps in it, else in or beside it."""
     if fills_hull:
@@ -276,9 +324,9 @@ def _claim(
         first, last = start[region.parent], start[region.parent + 1]
         is_inside = _under(region.columns, rows[first:last, 1:], fills_hull=not params.fills_buildings)
         is_in_row = has_houses[region.parent] and is_long[region.parent]
-        is_large = is_in_row or np.count_nonzero(is_inside) > _MOST_OF_HOUSE * (last - first)
-        is_new = has_houses[region.parent] and is_large and region.share_new > 0.5
+        is_new = bool(has_houses[region.parent]) and region.share_new > 0.5
         is_new = is_new and region.n_voxels * params.voxel_m**3 > params.part_is_new_m3
+        is_new = is_new and (is_in_row or _least_side(region.columns) * params.voxel_m > _WIDE * params.frontage_m)
         most_of = 1.0 if is_new or is_plant[region.parent] else _MOST_OF_ROW if is_in_row else _MOST_OF
         if np.count_nonzero(is_inside) > most_of * (last - first):
             continue

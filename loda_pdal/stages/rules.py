@@ -149,6 +149,15 @@ def extension(verdict: Verdict) -> Verdict:
     return verdict if label is None else Verdict(label, f"a piece of the building: {verdict.reason}")
 
 
+def screen(verdict: Verdict) -> Verdict:
+    """What stands before a house and hides nothing of it is a thing of its own, and the house has not grown."""
+    own = {ChangeLabel.INCREASED: ChangeLabel.ADDED, ChangeLabel.DECREASED: ChangeLabel.REMOVED}
+    label = own.get(verdict.label, verdict.label)
+    if label not in own.values():
+        return verdict
+    return Verdict(label, f"the wall behind it shows as before: {verdict.reason}")
+
+
 def _is_piece(cue: Cue, params: ChangeParams) -> bool:
     """Whether a part of a body that one survey alone shows is too small to be a building of its own."""
     is_body = params.fills_buildings and cue.object_class == ObjectClass.BUILDING
