@@ -10,6 +10,7 @@ from loda_pdal.params import Parameters
 from loda_pdal.stages.houses import house_behind
 
 BODIES = Parameters.preset("aerial").changes.for_bodies()
+Bounds = FloatArray | BoolArray
 CELL_M = BODIES.voxel_m
 
 
@@ -24,7 +25,7 @@ def columns_of(x: tuple[float, float], y: tuple[float, float], turn: float) -> t
     return cell[is_in].astype(np.int64), at[is_in]
 
 
-def behind(top: FloatArray, turn: float, annex_m: tuple[float, float], annex_top: float = 2.6) -> FloatArray | BoolArray:
+def behind(top: FloatArray, turn: float, annex_m: tuple[float, float], annex_top: float = 2.6) -> Bounds:
     """The house of an annex in front of a row 36 m long and 9 m deep, whose houses are 6 m wide; ``top`` of each."""
     row, at = columns_of((0, 36), (0, 9), turn)
     annex, _ = columns_of(annex_m, (-2.5, 0), turn)
