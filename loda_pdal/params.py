@@ -863,7 +863,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
         "instances": {
             "building_gap_m": 1.2,
             "roof_step_m": 1.0,
-            "annex_gap_m": 0.6,
+            "annex_gap_m": 1.0,
             "cluster_radius_m": 1.2,
             "patch_min_points": 30,
             "vegetation_min_points": 15,
@@ -897,7 +897,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "thing_voxels": 0,
             "part_min_voxels": 24,
             "part_is_new_m3": 80.0,
-            "frontage_m": 0.0,
+            "use_volume": False,
         },
         "observability": {"cell_m": 2.0},
         "confidence": {

@@ -94,6 +94,27 @@ def test_an_annex_of_a_house_that_stands_alone_makes_it_grow() -> None:
     assert [ChangeLabel(c) for c in swapped.label] == [ChangeLabel.DECREASED]
 
 
+def test_an_annex_changes_its_house_and_no_other_house_of_the_row() -> None:
+    row = np.concatenate([roof((6 * i, 6 * i + 6), (0, 9), 6.0 + 0.3 * (i % 2)) for i in range(5)])
+    annex = roof((13.5, 16.5), (-3, -0.2), 2.7)
+    with_annex = [(0, row), (0, annex)]
+    grown, cut = (
+        decide([(0, row)], with_annex, ObjectClass.BUILDING),
+        decide(with_annex, [(0, row)], ObjectClass.BUILDING),
+    )
+    for changes, sign in ((grown, ChangeLabel.INCREASED), (cut, ChangeLabel.DECREASED)):
+        assert sorted(changes.label) == sorted([ChangeLabel.UNCHANGED, sign, sign])
+        x = row[:, 0]
+        is_changed = changes.label[changes.owner.before[: len(row)]] == sign
+        assert x[is_changed].min() == pytest.approx(12.0, abs=0.6)
+        assert x[is_changed].max() == pytest.approx(18.0, abs=0.6)
+    own = grown.owner.after[len(row) : len(row) + len(annex)]
+    assert len(set(own.tolist())) == 1
+    house = grown.parent[own[0]]
+    assert grown.reason[house].startswith("a part of it changed")
+    assert grown.label[grown.parent[house]] == ChangeLabel.UNCHANGED
+
+
 def test_an_edge_that_was_sampled_once_is_no_change() -> None:
     house, edge = roof((0, 10), (0, 9), 6.0), roof((10, 10.8), (0, 9), 6.0)
     changes = decide([(0, house)], [(0, np.concatenate([house, edge]))], ObjectClass.BUILDING)

@@ -20,6 +20,7 @@ from loda_pdal.model.labels import ObjectClass
 from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams
 from loda_pdal.stages.cues import Cells, Surface
+from loda_pdal.stages.houses import house_behind
 
 _LINK_VOXELS = 2.9
 """Changed voxels this far apart, in voxels, are one region: the rays of a vehicle leave stripes."""
@@ -60,13 +61,14 @@ class Parts:
 
 
 class Region(NamedTuple):
-    """Connected voxels of one object: their columns (k, 2), the voxels (m,), and the share of the columns in which the
-    other epoch has nothing of the object."""
+    """Connected voxels of one object: their columns (k, 2), the voxels (m,), the share of the columns in which the
+    other epoch has nothing of the object, and how high (m) half of the columns reach."""
 
     parent: int
     columns: Int64Array
     voxels: Int64Array
     share_new: float
+    top_m: float
 
     @property
     def n_voxels(self) -> int:
@@ -85,7 +87,8 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, 
 
     A building up to that length is one house, or two of which one came or went. What changed of a longer one is part
     of a house in a row: ``frontage_m`` of the row about it are taken out too, as the house that it is a part of.
-    Bodies beside other bodies are looked through whatever their length: where one house of a row ends is not certain.
+    Bodies beside other bodies are looked through whatever their length, and what was built onto one or taken from it has
+    the house behind it taken out, wherever a row of them was cut: see `house_behind`.
 
     Plants grow together: where a piece of a plant, ``plant_width_m`` wide, stands on what the other survey saw bare, it
     is a plant of its own, and not a growth of its neighbour.
@@ -102,9 +105,7 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, 
     is_long = np.fmax(box[:, 0], box[:, 1]) > params.part_of_length_m
     columns_of = _columns_of(cells, n)
     has_houses = (object_class == ObjectClass.BUILDING) & (params.frontage_m > 0)
-    is_split = is_long | has_houses
-    if params.fills_buildings:
-        is_split |= _are_in_rows(columns_of[0], n)
+    is_split = is_long | (_are_in_rows(columns_of[0], n) if params.fills_buildings else has_houses)
     is_plant = is_pair & (object_class == ObjectClass.VEGETATION) & (params.plant_width_m > 0)
     is_split &= is_pair & ~is_plant
     own = cells.owner
@@ -120,8 +121,10 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, 
         bare = cells.bare_columns
         regions += connected_regions(cells, own, bare.after, is_plant, *plant)
         regions += connected_regions(cells, own.swapped, bare.before, is_plant, *plant)
+    is_of_bodies = params.fills_buildings and bool(has_houses.any())
+    top = _tops(surfaces, columns_of[0], params.voxel_m) if is_of_bodies else None
     columns, part, parent, is_house, is_extension = _claim(
-        regions, columns_of, has_houses & is_pair, is_long, is_plant, params
+        regions, columns_of, has_houses & is_pair, is_long, is_plant, top, params
     )
     if len(parent) == 0:
         return Parts(owner, nobody, nothing, nothing)
@@ -221,6 +224,21 @@ def _columns_of(cells: Cells, n: int) -> tuple[Int64Array, Int64Array]:
     return rows, np.searchsorted(rows[:, 0], np.arange(n + 1))
 
 
+def _tops(surfaces: Pair[Surface], columns: Int64Array, cell_m: float) -> FloatArray:
+    """Highest point (k,) m of each of the sorted ``columns`` (k, 3), that of the lower epoch where both have some."""
+    lattice = Lattice.around(columns)
+    keys = lattice.keys(columns)
+    tops = []
+    for surface in surfaces:
+        own = np.flatnonzero(surface.owner >= 0)
+        cell = np.column_stack([surface.owner[own].astype(np.int64), cells_of(surface.xyz[own, :2], cell_m)])
+        found = lattice.find(keys, cell)
+        top = np.full(len(keys), -np.inf)
+        np.maximum.at(top, found[found >= 0], surface.xyz[own[found >= 0], 2])
+        tops.append(np.where(np.isfinite(top), top, np.inf))
+    return np.asarray(np.minimum(*tops))
+
+
 def _are_in_rows(columns: Int64Array, n: int) -> BoolArray:
     """Whether each object (n,) has columns beside those of another; ``columns`` (k, 3) are (object, ix, iy)."""
     plan = columns[:, 1:]
@@ -263,11 +281,13 @@ def connected_regions(
     found = []
     for index in np.flatnonzero(groups.counts >= least).tolist():
         inside = groups.members(index)
+        # voxels are sorted: the last one of a column is its highest
         plan, first = np.unique(cells.voxels.cell[members[inside], :2], axis=0, return_index=True)
+        top_m = float(np.median(cells.voxels.centre[members[inside][np.append(first[1:], len(inside)) - 1], 2]))
         if width > 0 and width_of(plan) < width:
             continue
         share_new = 1.0 - float(is_shared[inside[first]].mean())
-        found.append(Region(int(own[inside[0]]), plan, members[inside], share_new))
+        found.append(Region(int(own[inside[0]]), plan, members[inside], share_new, top_m))
     return found
 
 
@@ -308,10 +328,11 @@ def _claim(
     has_houses: BoolArray,
     is_long: BoolArray,
     is_plant: BoolArray,
+    top: FloatArray | None,
     params: ChangeParams,
 ) -> tuple[Int64Array, Int64Array, IntArray, BoolArray, BoolArray]:
     """Columns (k, 3) that parts take, the part of each, and for each part its parent, whether it is a house, and
-    whether it is built onto one.
+    whether it is built onto one. ``top`` (k,) m of the columns, where buildings are bodies.
 
     The largest region comes first. The parent of a part in a house that is a part itself, number p, is ``-1 - p``.
     """
@@ -334,20 +355,25 @@ def _claim(
         if is_free.any():
             width_m = float((np.ptp(region.columns, axis=0) + 1).max()) * params.voxel_m
             is_storey = region.share_new < 0.5 and width_m > _WIDE * params.frontage_m
-            is_annex = width_m > _LEAST_ANNEX_M and not is_new and not is_storey
-            is_extension.append(bool(has_houses[region.parent]) and is_annex)
-            if is_in_row and is_extension[-1]:
+            is_onto = bool(has_houses[region.parent]) and width_m > _LEAST_ANNEX_M and not is_new and not is_storey
+            is_extension.append(is_onto and top is None)  # of a body it is known once its house is found
+            if is_onto and (is_in_row if top is None else region.share_new > 0.5):
                 in_rows.append((len(parents), region))
             part_of[first:last][is_free] = len(parents)
             parents.append(region.parent)
     is_house = [False] * len(parents)
     for part, region in in_rows:
-        first, last = start[region.parent], start[region.parent + 1]
-        is_free = _house_about(region.columns, rows[first:last, 1:], params) & (part_of[first:last] < 0)
-        if is_free.any():
+        if top is None:
+            free = np.arange(start[region.parent], start[region.parent + 1])
+            free = free[_house_about(region.columns, rows[free, 1:], params) & (part_of[free] < 0)]
+        else:
+            free = np.flatnonzero((part_of < 0) & has_houses[rows[:, 0]])
+            free = free[house_behind(region.columns, region.top_m, rows[free, 1:], top[free], params)]
+        if len(free):
+            is_extension[part] = True
             parents[part] = -1 - len(parents)
-            part_of[first:last][is_free] = len(parents)
-            parents.append(region.parent)
+            part_of[free] = len(parents)
+            parents.append(int(np.bincount(rows[free, 0]).argmax()))
             is_house.append(True)
             is_extension.append(False)
     is_claimed = part_of >= 0

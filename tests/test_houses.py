@@ -1,0 +1,73 @@
+"""The house behind an annex: from party wall to party wall, whichever way the row lies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array
+from loda_pdal.params import Parameters
+from loda_pdal.stages.houses import house_behind
+
+BODIES = Parameters.preset("aerial").changes.for_bodies()
+Bounds = FloatArray | BoolArray
+CELL_M = BODIES.voxel_m
+
+
+def columns_of(x: tuple[float, float], y: tuple[float, float], turn: float) -> tuple[Int64Array, FloatArray]:
+    """Columns (k, 2) under a rectangle that was turned about the origin, and their centres (k, 2) m before that."""
+    ends = np.array([x, y]).T
+    far = float(np.abs(ends).max()) * 1.5
+    cell = np.stack(np.meshgrid(*[np.arange(-far, far, CELL_M)] * 2), axis=-1).reshape(-1, 2) // CELL_M
+    back = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    at = ((cell + 0.5) * CELL_M) @ back.T
+    is_in = np.all((at > ends[0]) & (at < ends[1]), axis=1)
+    return cell[is_in].astype(np.int64), at[is_in]
+
+
+def behind(top: FloatArray, turn: float, annex_m: tuple[float, float], annex_top: float = 2.6) -> Bounds:
+    """The house of an annex in front of a row 36 m long and 9 m deep, whose houses are 6 m wide; ``top`` of each."""
+    row, at = columns_of((0, 36), (0, 9), turn)
+    annex, _ = columns_of(annex_m, (-2.5, 0), turn)
+    height = top[(at[:, 0] // 6).astype(int)] + np.random.default_rng(1).normal(0, 0.02, len(row))
+    found = house_behind(annex, annex_top, row, height, BODIES)
+    if not found.any():
+        return found
+    order = np.random.default_rng(0).permutation(len(row))
+    np.testing.assert_array_equal(house_behind(annex, annex_top, row[order], height[order], BODIES), found[order])
+    return np.column_stack([at[found].min(axis=0), at[found].max(axis=0)])
+
+
+STEPS = 7.0 + np.array([0.0, 0.25, 0.0, 0.3, 0.1, 0.4])
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.35, 0.785, 1.5, -2.0])
+def test_it_reaches_from_party_wall_to_party_wall(turn: float) -> None:
+    (x_low, x_high), (y_low, y_high) = behind(STEPS, turn, (12.5, 15.0))
+    assert x_low == pytest.approx(12.0, abs=1.2)
+    assert x_high == pytest.approx(18.0, abs=1.2)
+    assert y_low < 0.8
+    assert y_high > 8.2
+
+
+def test_it_is_one_frontage_where_no_roof_steps() -> None:
+    (x_low, x_high), _ = behind(np.full(6, 7.0), 0.3, (15.0, 18.0))
+    assert x_low == pytest.approx(13.5, abs=1.0)
+    assert x_high == pytest.approx(19.5, abs=1.0)
+
+
+def test_it_begins_at_the_end_of_the_row() -> None:
+    (x_low, x_high), _ = behind(np.full(6, 7.0), 0.3, (1.0, 4.0))
+    assert x_low < 0.8
+    assert x_high == pytest.approx(6.0, abs=1.0)
+
+
+def test_what_is_as_high_as_the_house_is_not_built_onto_it() -> None:
+    assert not behind(STEPS, 0.0, (12.5, 15.0), annex_top=6.5).any()
+
+
+def test_what_stands_apart_is_not_built_onto_anything() -> None:
+    row, _ = columns_of((0, 36), (0, 9), 0.0)
+    shed, _ = columns_of((12, 15), (-6, -3), 0.0)
+    assert not house_behind(shed, 2.6, row, np.full(len(row), 7.0), BODIES).any()
+    assert not house_behind(shed, 2.6, row[:0], np.zeros(0), BODIES).any()
