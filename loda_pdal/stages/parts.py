@@ -87,8 +87,8 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, 
 
     A building up to that length is one house, or two of which one came or went. What changed of a longer one is part
     of a house in a row: ``frontage_m`` of the row about it are taken out too, as the house that it is a part of.
-    Bodies beside other bodies are looked through whatever their length, and what was built onto one or taken from it has
-    the house behind it taken out, wherever a row of them was cut: see `house_behind`.
+    Bodies beside other bodies are looked through whatever their length, and what was built onto one or taken from it
+    has the house behind it taken out, wherever a row of them was cut: see `house_behind`.
 
     Plants grow together: where a piece of a plant, ``plant_width_m`` wide, stands on what the other survey saw bare, it
     is a plant of its own, and not a growth of its neighbour.
@@ -347,7 +347,8 @@ def _claim(
         is_in_row = has_houses[region.parent] and is_long[region.parent]
         is_new = bool(has_houses[region.parent]) and region.share_new > 0.5
         is_new = is_new and region.n_voxels * params.voxel_m**3 > params.part_is_new_m3
-        is_new = is_new and (is_in_row or _least_side(region.columns) * params.voxel_m > _WIDE * params.frontage_m)
+        is_wide = top is None and _least_side(region.columns) * params.voxel_m > _WIDE * params.frontage_m
+        is_new = is_new and (is_in_row or is_wide)
         most_of = 1.0 if is_new or is_plant[region.parent] else _MOST_OF_ROW if is_in_row else _MOST_OF
         if np.count_nonzero(is_inside) > most_of * (last - first):
             continue
