@@ -29,7 +29,9 @@ _STILL_SEEN = 0.9
 """Share of them that one still sees through what stands before the wall."""
 
 
-def are_built_on(cells: Cells, surfaces: Pair[Surface], parent: IntArray, is_asked: BoolArray) -> BoolArray:
+def are_built_on(
+    cells: Cells, surfaces: Pair[Surface], parent: IntArray, is_asked: BoolArray, *, has_walls: bool
+) -> BoolArray:
     """Which of the parts of houses ``is_asked`` (n,) are solid: what came or went of them is smooth and hid the wall.
 
     Parameters
@@ -40,12 +42,16 @@ def are_built_on(cells: Cells, surfaces: Pair[Surface], parent: IntArray, is_ask
         Points with their objects, 0 to ``n - 1``.
     parent : (n,) int32
         The house of each part.
+    has_walls : bool
+        Whether the surveys show walls: from the air there are hardly any to see through what stands before them.
     """
     came_or_went = cells.voxels.at_points(Pair(cells.is_lost, cells.is_gained), surfaces)
     new = surfaces.join(came_or_went, lambda side, is_new: side.only(is_new & np.append(is_asked, False)[side.owner]))
-    is_smooth = roughness(new, is_asked) < FOLIAGE_M
+    is_smooth = np.asarray(is_asked & (roughness(new, is_asked) < FOLIAGE_M))
+    if not has_walls:
+        return is_smooth
     is_open = _is_seen_through(new.before, surfaces, parent) | _is_seen_through(new.after, surfaces.swapped, parent)
-    return np.asarray(is_asked & is_smooth & ~is_open)
+    return np.asarray(is_smooth & ~is_open)
 
 
 def _is_seen_through(new: Surface, surfaces: Pair[Surface], parent: IntArray) -> BoolArray:

@@ -125,7 +125,8 @@ def decide_changes(
         verdict_of(cue, apart, part, params, observability)
         for cue, apart, part in zip(cues, cast.is_apart.tolist(), is_part.tolist(), strict=True)
     ]
-    is_screen = screens(cells, cast.object_class == ObjectClass.BUILDING, cast.is_extension)
+    has_walls = not params.fills_buildings
+    is_screen = screens(cells, cast.object_class == ObjectClass.BUILDING, cast.is_extension & has_walls)
     for i in np.flatnonzero(cast.is_extension).tolist():
         verdicts[i] = screen(verdicts[i]) if is_screen[i] else extension(verdicts[i])
     raw = np.array(
@@ -135,7 +136,7 @@ def decide_changes(
         ]
     )
     is_of_house = np.append(cast.is_house, False)[cast.parent] & cast.is_extension & ~is_screen
-    is_built_on = are_built_on(cells, cast.surfaces, cast.parent, is_of_house)
+    is_built_on = are_built_on(cells, cast.surfaces, cast.parent, is_of_house, has_walls=has_walls)
     for i, part in changed_houses(verdicts, cast.parent, is_built_on, evidence.dv).items():
         verdicts[i] = Verdict(verdicts[part].label, f"a part of it changed: {verdicts[part].reason}")
         raw[i] = raw[part]
