@@ -258,7 +258,8 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
         has_height &= is_solid or (is_alike and abs(cue.column_rise) > max(gate, height_m))
     # a top that moves by more than what hides a voxel leaves voxels behind
     is_hideable = not params.needs_sight or abs(cue.dh) < _HIDES_VOXEL * params.query_radius_m
-    rise = cue.column_rise if is_hideable and is_alike else math.nan
+    is_thing = params.needs_sight and cue.object_class == ObjectClass.OTHER
+    rise = cue.column_rise if is_hideable and is_alike and not is_thing else math.nan
     is_crown = params.needs_sight and is_green and cue.tall >= _LOW_M
     enough = max(gate, height_m if is_crown else height_m / 2)
     is_raised = least == 0 or cue.gained_above >= least_above or rise > enough
