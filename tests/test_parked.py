@@ -38,7 +38,7 @@ def found(*things: FloatArray) -> list[set[int]]:
     """The vehicles of each thing; ground at z = 0."""
     xyz = np.concatenate(things)
     features = eigen_features(xyz, xyz[:, 2], STREET.features)
-    vehicle = parked_vehicles(xyz, xyz[:, 2], features.normals, np.ones(len(xyz), np.bool_), STREET.semantics)
+    vehicle, _ = parked_vehicles(xyz, xyz[:, 2], features.normals, np.ones(len(xyz), np.bool_), STREET.semantics)
     ends = np.cumsum([len(thing) for thing in things])
     parts = np.split(vehicle, ends[:-1])
     return [
@@ -92,6 +92,7 @@ def test_a_preset_without_them_finds_none() -> None:
     for name in ("aerial", "paper"):
         params = Parameters.preset(name).semantics
         normals = np.zeros((len(CAR), 3), np.float32)
-        assert np.all(parked_vehicles(CAR, CAR[:, 2], normals, np.ones(len(CAR), np.bool_), params) == -1)
-    none = parked_vehicles(CAR[:0], CAR[:0, 2], normals[:0], np.zeros(0, np.bool_), STREET.semantics)
+        vehicle, is_solid = parked_vehicles(CAR, CAR[:, 2], normals, np.ones(len(CAR), np.bool_), params)
+        assert np.all(vehicle == -1) and not is_solid.any()
+    none, _ = parked_vehicles(CAR[:0], CAR[:0, 2], normals[:0], np.zeros(0, np.bool_), STREET.semantics)
     assert len(none) == 0

@@ -77,6 +77,7 @@ def form_instances(
     classification[(buildings < 0) & (classification == ObjectClass.BUILDING)] = ObjectClass.OTHER
     is_vehicle = (buildings < 0) & (semantics.vehicle >= 0)
     classification[is_vehicle] = ObjectClass.MOBILE
+    classification[semantics.is_solid & (classification == ObjectClass.VEGETATION)] = ObjectClass.OTHER
 
     if params.join_by_footprint:
         _judge_clusters(xyz, height, classification, ~is_vehicle, params, rules)

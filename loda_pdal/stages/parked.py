@@ -41,8 +41,8 @@ _TRIM_M = 0.3
 
 def parked_vehicles(
     xyz: FloatArray, height: FloatArray, normals: Float32Array, is_loose: BoolArray, params: SemanticParams
-) -> IntArray:
-    """Vehicle (m,) of each point, 0 to ``n - 1``, -1 none.
+) -> tuple[IntArray, BoolArray]:
+    """Vehicle (m,) of each point, 0 to ``n - 1``, -1 none; and which points (m,) lie low and smooth: on what is solid.
 
     Parameters
     ----------
@@ -58,8 +58,9 @@ def parked_vehicles(
     vehicle = np.full(len(xyz), -1, dtype=np.int32)
     is_low = height < params.mobile_height_m
     low = np.flatnonzero(is_loose & is_low)
+    is_solid = np.zeros(len(xyz), np.bool_)
     if params.vehicle_roughness == 0 or len(low) < _LEAST_VOXELS:
-        return vehicle
+        return vehicle, is_solid
     above = np.flatnonzero(is_loose & ~is_low & (height < params.mobile_height_m + 1.0))
     place, shape = _columns(xyz[np.concatenate([low, above]), :2])
     is_tall = np.zeros(shape, np.bool_)
@@ -67,6 +68,7 @@ def parked_vehicles(
     is_pole = is_tall & ~ndimage.binary_opening(is_tall, np.ones((3, 3)))  # crowns are wider
     place = place[: len(low)]
     is_smooth = _roughness(xyz[low], normals[low], place, shape) < params.vehicle_roughness
+    is_solid[low[is_smooth]] = True
     is_open = ~is_pole.ravel()[place]
     rest = np.flatnonzero(is_smooth & is_open)
     n = 0
@@ -83,7 +85,7 @@ def parked_vehicles(
     if len(body) and len(trim):
         found, _ = nearest(xyz[body], xyz[trim], _TRIM_M)
         vehicle[trim] = np.where(found >= 0, vehicle[body[found]], -1)
-    return vehicle
+    return vehicle, is_solid
 
 
 def across(xyz: FloatArray, normals: Float32Array) -> tuple[IntArray, FloatArray, FloatArray]:

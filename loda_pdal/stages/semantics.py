@@ -49,6 +49,8 @@ class Semantics:
         The piece of a superpoint that was classified as one: the superpoint itself, or one of its planes.
     vehicle : (m,) int32
         Vehicle that each voxel belongs to, -1 none (`parked_vehicles`).
+    is_solid : (m,) bool
+        Whether a voxel lies low and smooth: no foliage, whatever its superpoint.
     plane_group : (s,) int32
         Segments with one number lie in one plane after merging coplanar neighbours; -1 where not planar.
     adjacency : (e, 2) int64
@@ -60,6 +62,7 @@ class Semantics:
     classification: ByteArray
     segment: IntArray
     vehicle: IntArray
+    is_solid: BoolArray
     plane_group: IntArray
     adjacency: Int64Array
     contact: Int64Array
@@ -117,8 +120,8 @@ def classify(
         is_low = np.abs(values[:, _HEIGHT]) < params.ground_distance_m
         classification = np.where(is_low, np.uint8(ObjectClass.GROUND), classification)
     is_loose = (classification != ObjectClass.GROUND) & (classification != ObjectClass.BUILDING)
-    vehicle = parked_vehicles(xyz, values[:, _HEIGHT].astype(np.float64), features.normals, is_loose, params)
-    return Semantics(classification, superpoint, vehicle, plane_group, adjacency, contact)
+    vehicle, is_solid = parked_vehicles(xyz, values[:, _HEIGHT].astype(np.float64), features.normals, is_loose, params)
+    return Semantics(classification, superpoint, vehicle, is_solid, plane_group, adjacency, contact)
 
 
 def split_at_edges(
