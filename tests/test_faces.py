@@ -1,62 +1,68 @@
-"""Offsets of upright faces against moves that are known."""
+"""One method, four faces: the command, Python, PDAL and the embedded runner say the same of every simulated point."""
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import laspy
 import numpy as np
 import pytest
 
-from loda_pdal.model.cloud import FloatArray
-from loda_pdal.model.pair import Pair
-from loda_pdal.stages.cues import Surface
-from loda_pdal.stages.faces import face_offset
-
-ALONG = np.arange(0.0, 8.0, 0.25)
-
-
-def wall(y: FloatArray | float, owner: int = 0, noise_m: float = 0.0) -> Surface:
-    """A face along x, 1 m high, whose place across may change along it."""
-    x, z = (grid.ravel() for grid in np.meshgrid(ALONG, np.arange(0.1, 1.1, 0.25), indexing="ij"))
-    across = np.interp(x, ALONG, np.broadcast_to(y, ALONG.shape))
-    across = across + np.random.default_rng(len(x)).normal(0.0, noise_m, len(x))
-    n = len(x)
-    normals = np.tile(np.array([0, -1, 0], np.float32), (n, 1))
-    return Surface(
-        np.column_stack([x, across, z]),
-        normals,
-        z,
-        np.full(n, 5, np.int32),
-        np.full(n, owner, np.int32),
-        np.ones(n, bool),
-    )
+from loda_pdal import Parameters, detect_changes, read_epochs
+from loda_pdal.benchmark.simulate import SimulationOptions, simulate_block, write_block
+from loda_pdal.cli.main import run
+from loda_pdal.model.records import ChangeResult
+from loda_pdal.pdal_face import run_pipeline
 
 
-ASKED = np.ones(1, np.bool_)
+@pytest.fixture(scope="module")
+def block(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with before.laz and after.laz of a street with planted edits."""
+    folder = tmp_path_factory.mktemp("block")
+    write_block(simulate_block(12, SimulationOptions(length_m=60.0, density=0.4)), folder)
+    return folder
 
 
-@pytest.mark.parametrize("moved_m", [0.0, 0.05, -0.2])
-def test_a_face_that_moved_as_a_whole(moved_m: float) -> None:
-    assert face_offset(Pair(wall(0.0), wall(moved_m)), ASKED) == pytest.approx([abs(moved_m)], abs=1e-6)
+@pytest.fixture(scope="module")
+def result(block: Path) -> ChangeResult:
+    surveys = read_epochs(block / "before.laz", block / "after.laz")
+    return detect_changes(surveys.before, surveys.after, Parameters.preset("street"))
 
 
-def test_noise_is_hardly_an_offset() -> None:
-    noisy = Pair(wall(0.0, noise_m=0.02), wall(0.0))
-    assert face_offset(noisy, ASKED)[0] < 0.03
-    assert face_offset(noisy, ASKED) == face_offset(noisy.swapped, ASKED)
+def check(points: laspy.LasData, result: ChangeResult) -> None:
+    """The cloud carries what Python found, point by point, before first."""
+    for name, field in (("ChangeClass", "change"), ("ObjectId", "object"), ("InstanceId", "instance")):
+        found = np.concatenate([getattr(side, field) for side in result.points])
+        assert np.array_equal(np.asarray(points[name]), found), name
+    assert len(set(np.unique(np.asarray(points["ChangeClass"])).tolist()) & {2, 3, 4, 5}) >= 3
 
 
-def test_what_moved_for_the_most_part_only_did_not_move() -> None:
-    bent = np.where(ALONG < 2.5, 0.0, 0.1)
-    assert face_offset(Pair(wall(0.0), wall(bent)), ASKED)[0] < 0.05
+def test_the_command(block: Path, result: ChangeResult, tmp_path: Path) -> None:
+    arguments = ["detect", str(block / "before.laz"), str(block / "after.laz"), "-o", str(tmp_path / "out")]
+    assert run([*arguments, "--preset", "auto", "-q"]) == 0
+    about = json.loads((tmp_path / "out" / "run.json").read_text())["run"]
+    assert about["preset"] == "street" and "densest quarter of the plan" in about["preset_reason"]
+    check(laspy.read(tmp_path / "out" / "changes.laz"), result)
 
 
-def test_walls_do_not_see_each_other() -> None:
-    before, after = wall(0.0), wall(0.1, owner=1)
-    both = Pair(before, after)
-    assert np.isnan(face_offset(both, np.ones(2, np.bool_))).all()
+@pytest.mark.parametrize("engine", [pytest.param("pdal", marks=pytest.mark.pdal), "embedded"])
+def test_the_pipeline(engine: str, block: Path, result: ChangeResult, pipelines_dir: Path, tmp_path: Path) -> None:
+    overrides = {
+        "stage.before.filename": str(block / "before.laz"),
+        "stage.after.filename": str(block / "after.laz"),
+        "stage.output.filename": str(tmp_path / "out.laz"),
+        "filters.python.pdalargs": json.dumps({"run": str(tmp_path / "run"), "preset": "auto"}),
+    }
+    assert run_pipeline(pipelines_dir / "change.json", overrides, engine=engine).engine == engine
+    check(laspy.read(tmp_path / "out.laz"), result)
 
 
-def test_nothing_asked_for_and_too_few_faces() -> None:
-    pair = Pair(wall(0.0), wall(0.1))
-    assert np.isnan(face_offset(pair, np.zeros(1, np.bool_))).all()
-    few = pair.map(lambda side: side.only(np.arange(len(side.owner)) < 24))
-    assert np.isnan(face_offset(few, ASKED)).all()
+def test_the_example(block: Path, result: ChangeResult) -> None:
+    example = Path(__file__).parent.parent / "examples" / "largest_changes.py"
+    arguments = [sys.executable, str(example), str(block / "before.laz"), str(block / "after.laz")]
+    done = subprocess.run(arguments, capture_output=True, text=True, timeout=300, check=True)
+    largest = max(result.changes, key=lambda change: change.footprint.area)
+    assert done.stdout.splitlines()[0].endswith(largest.reason)
