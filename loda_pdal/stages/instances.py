@@ -17,6 +17,7 @@ from loda_pdal.model.grid import Lattice
 from loda_pdal.model.groups import Groups, consecutive, count_cells, favourites
 from loda_pdal.model.labels import ObjectClass
 from loda_pdal.params import InstanceParams, SemanticParams
+from loda_pdal.stages.parked import MARGIN_M
 from loda_pdal.stages.semantics import Semantics, fit_planes, voxel_volume
 
 
@@ -367,7 +368,7 @@ def _judge(
     size = upright_boxes(xyz, cluster, n).size
     length, width, tall = np.maximum(size[:, 0], size[:, 1]), np.minimum(size[:, 0], size[:, 1]), size[:, 2]
     fits = (
-        (length < rules.mobile_length_m + _VEHICLE_MARGIN_M)
+        (length < rules.mobile_length_m + MARGIN_M)
         & (width < rules.mobile_width_m)
         & (tall < rules.mobile_height_m)
         & (voxel_volume(xyz, cluster, n, 0.5) < rules.mobile_volume_m3)
@@ -379,10 +380,6 @@ def _judge(
         np.uint8
     )
     return judged, fits
-
-
-_VEHICLE_MARGIN_M = 1.5
-"""Vans and trailers are longer than the paper's 5 m; the limit is for superpoints, this is added for whole clusters."""
 
 
 def _vegetation(

@@ -32,7 +32,7 @@ _LEAST_VOXELS = 40
 _FOOT_M = 0.8
 """A vehicle's lowest point lies no higher above the ground."""
 
-_MARGIN_M = 1.5
+MARGIN_M = 1.5
 """Vans and trailers are longer than the paper's 5 m; the limit is for superpoints, this is added for whole vehicles."""
 
 _TRIM_M = 0.3
@@ -123,6 +123,6 @@ def _of_vehicle_size(xyz: FloatArray, height: FloatArray, gap_m: float, params: 
     length, width, tall = size[:, :2].max(axis=1), size[:, :2].min(axis=1), size[:, 2]
     groups = Groups(thing, n)
     fits = (length > _LEAST_M[0]) & (width > _LEAST_M[1]) & (tall > _LEAST_M[2])
-    fits &= (length < params.mobile_length_m + _MARGIN_M) & (width < params.mobile_width_m)
+    fits &= (length < params.mobile_length_m + MARGIN_M) & (width < params.mobile_width_m)
     fits &= (groups.counts >= _LEAST_VOXELS) & (groups.minimum(height) < _FOOT_M)
     return np.where(fits, np.cumsum(fits) - 1, -1).astype(np.int32)[thing]
