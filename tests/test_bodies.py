@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
@@ -51,6 +53,11 @@ def decide(
     pair = Pair(surface(before, ground), surface(after, ground)).map(
         lambda side: filled_everywhere(side, params.voxel_m)
     )
+    return _decided(pair, classes, params)
+
+
+def _decided(pair: Pair[Surface], classes: Sequence[ObjectClass], params: ChangeParams) -> Changes:
+    """Labels of objects where both surveys looked everywhere, with a limit of detection of 0.05 m."""
     cells = np.unique(np.floor(np.concatenate([side.xyz for side in pair])).astype(np.int32), axis=0)
     n = len(cells)
     lod = LodGrid(
@@ -190,15 +197,7 @@ def vegetation(before: list[FloatArray], after: list[FloatArray], params: Change
         surface([(0, np.concatenate(before))], GROUND),
         surface([(0, np.concatenate(after))], GROUND),
     )
-    cells = np.unique(np.floor(np.concatenate([side.xyz for side in pair])).astype(np.int32), axis=0)
-    n = len(cells)
-    lod = LodGrid(
-        cells, 1.0, np.full(n, 0.05, np.float32), np.zeros((n, 3), np.float32), np.full(n, 50, np.int32),
-        np.full(n, 50, np.int32), np.ones(n, np.bool_), np.zeros(n, np.float32), 0.5,
-    )  # fmt: skip
-    seen = Pair(coverage(GROUND, AERIAL.observability), coverage(GROUND, AERIAL.observability))
-    codes = np.array([ObjectClass.VEGETATION], dtype=np.uint8)
-    return decide_changes(pair, codes, seen, lod, params, ObservabilityParams(), ConfidenceParams())
+    return _decided(pair, [ObjectClass.VEGETATION], params)
 
 
 def test_a_tree_felled_beside_its_neighbour_is_removed_and_the_neighbour_stays() -> None:

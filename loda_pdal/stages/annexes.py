@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from loda_pdal.kernels.neighbours import nearest
+from loda_pdal.model.boxes import upright_boxes
 from loda_pdal.model.cloud import BoolArray, IntArray
 from loda_pdal.model.groups import Groups
 from loda_pdal.model.pair import Pair
@@ -79,3 +80,48 @@ def _is_seen_through(new: Surface, surfaces: Pair[Surface], parent: IntArray) ->
     still, _ = nearest(shown.xyz[shown.owner >= 0], other.xyz[wall], _SAME_M)
     counts = np.bincount(part, minlength=n)
     return np.asarray((counts >= _LEAST_BEHIND) & (np.bincount(part[still >= 0], minlength=n) >= _STILL_SEEN * counts))
+
+
+def screens(cells: Cells, is_wall: BoolArray, is_asked: BoolArray) -> BoolArray:
+    """Which of the objects asked for (n,) stand before walls and hide nothing of them: scaffolding, say.
+
+    What is built onto a house takes the wall behind it out of sight. Where the epoch that has the object shows the wall
+    behind it all the same, as the other epoch does, rays pass through, and the house is what it was.
+
+    Parameters
+    ----------
+    cells : Cells
+        Voxels with their owners.
+    is_wall : (n,) bool
+        Objects that walls may belong to.
+    is_asked : (n,) bool
+        Objects that came or went before one.
+    """
+    voxels, n = cells.voxels, len(is_asked)
+    asked, wall = np.append(is_asked, False), np.append(is_wall, False)
+    found = np.zeros(n, np.bool_)
+    for own, other, near, is_new in (
+        (cells.owner.before, cells.owner.after, cells.is_near.before, cells.is_lost),
+        (cells.owner.after, cells.owner.before, cells.is_near.after, cells.is_gained),
+    ):
+        label = np.where(is_new & asked[own], own, -1)
+        boxes = upright_boxes(voxels.centre, label, n)
+        for i in np.unique(label[label >= 0]).tolist():
+            reach = boxes.size[i] / 2 + [0.0, _DEPTH_M, 0.0]
+            half = float(np.hypot(reach[0], reach[1]))
+            first, last = np.searchsorted(voxels.centre[:, 0], boxes.centre[i, 0] + np.array([-half, half]))
+            offset = (voxels.centre[first:last] - boxes.centre[i]) @ boxes.axes[i].T
+            is_behind = np.all(np.abs(offset) <= reach, axis=1) & wall[other[first:last]]
+            shown = near[first:last][is_behind]
+            found[i] |= len(shown) >= _LEAST_WALL and float(shown.mean()) >= _SEEN_THROUGH
+    return found
+
+
+_DEPTH_M = 1.5
+"""A wall this far behind what stands before it is looked for."""
+
+_LEAST_WALL = 60
+"""Voxels of a wall that must be known: what is small hides little of it whatever it is."""
+
+_SEEN_THROUGH = 0.95
+"""Share of them that show."""

@@ -15,14 +15,14 @@ from loda_pdal.model.labels import ChangeLabel, ObjectClass
 from loda_pdal.model.lod_grid import LodGrid
 from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams, ConfidenceParams, ObservabilityParams
-from loda_pdal.stages.annexes import are_built_on
+from loda_pdal.stages.annexes import are_built_on, screens
 from loda_pdal.stages.cast import FOLIAGE_M, Cast
 from loda_pdal.stages.confidence import calibrated
 from loda_pdal.stages.correspondence import rank_by_place
 from loda_pdal.stages.cues import Evidence, Surface, Voxels, median_rise, sample_voxels, share_beneath, weigh
 from loda_pdal.stages.faces import face_offset
 from loda_pdal.stages.observability import Coverage
-from loda_pdal.stages.parts import largest_regions, screens, split_parts
+from loda_pdal.stages.parts import largest_regions, split_parts
 from loda_pdal.stages.rules import (
     Cue,
     Verdict,

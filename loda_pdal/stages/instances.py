@@ -17,7 +17,7 @@ from loda_pdal.model.grid import Lattice
 from loda_pdal.model.groups import Groups, consecutive, count_cells, favourites
 from loda_pdal.model.labels import ObjectClass
 from loda_pdal.params import InstanceParams, SemanticParams
-from loda_pdal.stages.parked import MARGIN_M
+from loda_pdal.stages.parked import vehicle_sized
 from loda_pdal.stages.semantics import Semantics, fit_planes, voxel_volume
 
 
@@ -365,15 +365,10 @@ def _judge(
     """Class of each cluster seen as a whole, and whether it fits a vehicle's box, (n,) each."""
     n = int(cluster.max()) + 1
     groups = Groups(cluster, n)
-    size = upright_boxes(xyz, cluster, n).size
-    length, width, tall = np.maximum(size[:, 0], size[:, 1]), np.minimum(size[:, 0], size[:, 1]), size[:, 2]
-    fits = (
-        (length < rules.mobile_length_m + MARGIN_M)
-        & (width < rules.mobile_width_m)
-        & (tall < rules.mobile_height_m)
-        & (voxel_volume(xyz, cluster, n, 0.5) < rules.mobile_volume_m3)
-    )
-    is_body = (length > 1.5) & (width > 0.9) & (tall > 0.8) & (groups.minimum(height) < 0.8)
+    is_within, is_body = vehicle_sized(xyz, cluster, groups.minimum(height), rules)
+    low, high = groups.extremes(xyz[:, 2])
+    fits = is_within & (high - low < rules.mobile_height_m)
+    fits &= voxel_volume(xyz, cluster, n, 0.5) < rules.mobile_volume_m3
     is_body &= rules.vehicle_roughness == 0
     is_green = groups.share(classification == ObjectClass.VEGETATION) >= 0.5
     judged = np.select([is_green, is_body], [ObjectClass.VEGETATION, ObjectClass.MOBILE], ObjectClass.OTHER).astype(

@@ -32,7 +32,7 @@ _LEAST_VOXELS = 40
 _FOOT_M = 0.8
 """A vehicle's lowest point lies no higher above the ground."""
 
-MARGIN_M = 1.5
+_MARGIN_M = 1.5
 """Vans and trailers are longer than the paper's 5 m; the limit is for superpoints, this is added for whole vehicles."""
 
 _TRIM_M = 0.3
@@ -119,10 +119,21 @@ def _columns(xy: FloatArray) -> tuple[Int64Array, tuple[int, int]]:
 def _of_vehicle_size(xyz: FloatArray, height: FloatArray, gap_m: float, params: SemanticParams) -> IntArray:
     """Number (k,) of the connected things that have a vehicle's size and stand on the ground, -1 for what has not."""
     thing, n = consecutive(linked(xyz, gap_m))
-    size = upright_boxes(xyz, thing, n).size
-    length, width, tall = size[:, :2].max(axis=1), size[:, :2].min(axis=1), size[:, 2]
     groups = Groups(thing, n)
-    fits = (length > _LEAST_M[0]) & (width > _LEAST_M[1]) & (tall > _LEAST_M[2])
-    fits &= (length < params.mobile_length_m + MARGIN_M) & (width < params.mobile_width_m)
-    fits &= (groups.counts >= _LEAST_VOXELS) & (groups.minimum(height) < _FOOT_M)
+    is_within, is_body = vehicle_sized(xyz, thing, groups.minimum(height), params)
+    fits = is_within & is_body & (groups.counts >= _LEAST_VOXELS)
     return np.where(fits, np.cumsum(fits) - 1, -1).astype(np.int32)[thing]
+
+
+def vehicle_sized(
+    xyz: FloatArray, thing: IntArray, lowest: FloatArray, params: SemanticParams
+) -> tuple[BoolArray, BoolArray]:
+    """Which things (n,) are no longer and wider than a vehicle, and which are as large as one and stand on the ground.
+
+    ``thing`` (k,) of each point; ``lowest`` (n,) m, how high above the ground each begins.
+    """
+    size = upright_boxes(xyz, thing, len(lowest)).size
+    length, width, tall = size[:, :2].max(axis=1), size[:, :2].min(axis=1), size[:, 2]
+    is_within = (length < params.mobile_length_m + _MARGIN_M) & (width < params.mobile_width_m)
+    is_body = (length > _LEAST_M[0]) & (width > _LEAST_M[1]) & (tall > _LEAST_M[2]) & (lowest < _FOOT_M)
+    return is_within, is_body
