@@ -627,6 +627,7 @@ class GroundChangeParams(StageParams):
     min_dz_m: float = param(0.15, "smallest elevation change", unit="m", low=0, high=10)
     lod_factor: float = param(1.1, "the change must exceed this many LoD95", low=0, high=10)
     min_area_m2: float = param(12.0, "connected area that is reported", unit="m2", low=0, high=100000)
+    has_own_limit: bool = param(True, "a tile's limit is its own where the LoD grid has none so small")
 
 
 @dataclass(frozen=True)
@@ -924,7 +925,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
         },
         "instances": {"join_by_footprint": False, "splits_crowns": False, "other_min_voxels": 12},
         "observability": {"is_enabled": False},
-        "ground_changes": {"min_area_m2": 25.0},
+        "ground_changes": {"min_area_m2": 25.0, "has_own_limit": False},
         "changes": {
             "visible_only": False,
             "find_parts": False,

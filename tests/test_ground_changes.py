@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from loda_pdal.model.cloud import FloatArray
 from loda_pdal.model.labels import ChangeLabel
 from loda_pdal.model.pair import Pair
-from loda_pdal.params import Parameters
+from loda_pdal.params import GroundChangeParams, Parameters
 from loda_pdal.stages.ground_changes import GroundChanges, ground_changes
 from loda_pdal.stages.lod import level_of_detection
 
@@ -30,9 +32,9 @@ def _raised(xyz: FloatArray, low: tuple[float, float], high: tuple[float, float]
     return xyz + np.column_stack([np.zeros((len(xyz), 2)), np.where(is_in, dz, 0.0)])
 
 
-def _changes(clouds: Pair[FloatArray]) -> GroundChanges:
+def _changes(clouds: Pair[FloatArray], params: GroundChangeParams = PARAMS.ground_changes) -> GroundChanges:
     lod = level_of_detection(clouds.before, clouds.after, POSE, np.array([20.0, 20.0, 0.0]), PARAMS.lod)
-    return ground_changes(clouds, clouds.map(lambda xyz: np.ones(len(xyz), np.bool_)), lod, PARAMS.ground_changes)
+    return ground_changes(clouds, clouds.map(lambda xyz: np.ones(len(xyz), np.bool_)), lod, params)
 
 
 @pytest.mark.parametrize("dz", [0.3, -0.3])
@@ -124,3 +126,23 @@ def test_no_ground_at_all() -> None:
     np.testing.assert_array_equal(found.label_at(np.zeros((2, 2))), [0, 0])
     seen_once = _changes(Pair(nothing, _ground(1)))
     assert set(seen_once.label) == {ChangeLabel.UNDETERMINED}
+
+
+def test_a_sparse_yard_has_limits_of_its_own() -> None:
+    def sparse(seed: int, noise_m: float) -> FloatArray:
+        xyz = _ground(seed, spacing_m=0.45)  # 14 points within a metre, 30 make a cell of the LoD grid
+        return xyz + np.column_stack(
+            [np.zeros((len(xyz), 2)), np.random.default_rng(seed).normal(0, noise_m, len(xyz))]
+        )
+
+    fill = (10.0, 10.0), (18.0, 18.0), 0.3
+    found = _changes(Pair(sparse(1, 0.0), _raised(sparse(2, 0.0), *fill)))
+    (region,) = found.regions
+    assert region.dz_m == pytest.approx(0.3, abs=0.02)
+    assert region.lod95_m < 0.05
+    assert region.area_m2 == pytest.approx(64.0, abs=16.0)
+    letter = replace(PARAMS.ground_changes, has_own_limit=False)
+    assert _changes(Pair(sparse(1, 0.0), _raised(sparse(2, 0.0), *fill)), letter).regions == []
+    rough = _changes(Pair(sparse(1, 0.4), sparse(2, 0.4)))  # grass to the knee
+    assert rough.regions == []
+    assert np.nanmedian(rough.lod95) > 0.15

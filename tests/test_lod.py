@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from loda_pdal.model.cloud import FloatArray, to_local_grid
-from loda_pdal.model.lod_grid import LodGrid
+from loda_pdal.model.lod_grid import LodGrid, pose_jacobian
 from loda_pdal.model.transform import exp_se3, transform_points
 from loda_pdal.params import FuseParams, LodParams
 from loda_pdal.stages.drift import drift_covariance, rigid_part
 from loda_pdal.stages.fuse import fuse_points
-from loda_pdal.stages.lod import level_of_detection, pose_jacobian
+from loda_pdal.stages.lod import level_of_detection
 
 PARAMS = LodParams()
 NO_POSE = np.zeros((6, 6))
@@ -55,8 +55,9 @@ def test_level_plane_by_hand() -> None:
 def _pose_variance(
     point: FloatArray, normal: FloatArray, covariance: FloatArray, centre: FloatArray, term: str
 ) -> float:
-    (jacobian,) = pose_jacobian(point, normal, centre, term)
-    return float(jacobian @ covariance @ jacobian)
+    nothing = np.zeros((0, 3))
+    grid = level_of_detection(nothing, nothing, covariance, centre, replace(NO_DRIFT, pose_term=term))
+    return float(grid.limit_of(np.zeros(1), point, normal.reshape(1, 3))[0] / 1.96) ** 2
 
 
 def test_pose_term_grows_with_the_lever() -> None:
@@ -258,7 +259,7 @@ def test_what_a_rigid_move_makes_is_pose_and_no_drift() -> None:
     xyz, normal = rng.uniform(-50, 50, (3000, 3)), rng.normal(size=(3000, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     covariance = np.diag([0.01**2] * 3 + [2e-4**2] * 3)
-    jacobian = pose_jacobian(xyz, normal, ORIGIN, "full")
+    jacobian = pose_jacobian(xyz, normal, ORIGIN)
     twist = np.array([0.012, -0.008, 0.01, 1e-4, -2e-4, 2e-4])
     displacement = jacobian @ twist + rng.normal(0, 0.004, 3000)
     displacement[:300] += 0.5  # changes

@@ -11,6 +11,9 @@ from loda_pdal.kernels.parallel import run_ranges
 from loda_pdal.model.cloud import BoolArray, Float32Array, FloatArray, IntArray
 from loda_pdal.model.transform import transform_points
 
+Z_95 = 1.96
+"""Two-sided 95 % of the normal distribution."""
+
 
 @dataclass(frozen=True)
 class LodGrid:
@@ -37,6 +40,10 @@ class LodGrid:
         The value where nothing is valid, m.
     drift : (3, 3) float64, m2
         Covariance of what the epochs disagree by beyond noise and pose: trajectories drift.
+    pose : (6, 6) float64
+        Covariance of the twist (tx, ty, tz, rx, ry, rz) left between the epochs, m and rad.
+    centre : (3,) float64, m
+        Where the twist turns.
     """
 
     cells: IntArray
@@ -49,6 +56,8 @@ class LodGrid:
     displacement: Float32Array
     low_observability_m: float
     drift: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+    pose: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+    centre: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     @property
     def centres(self) -> FloatArray:
@@ -79,3 +88,24 @@ class LodGrid:
             result,
         )
         return result
+
+    def limit_of(self, variance: FloatArray, xyz: FloatArray, normal: FloatArray) -> FloatArray:
+        """LoD95 (k,) m of displacements along unit normals (k, 3) at points (k, 3), whose noise has the variance (k,).
+
+        The limit of what is not a cell, a raster tile for one: the same pose and drift, and a noise of its own.
+        """
+        jacobian = pose_jacobian(xyz, normal, self.centre)
+        return Z_95 * np.sqrt(variance + along(jacobian, self.pose) + along(normal, self.drift))
+
+
+def pose_jacobian(xyz: FloatArray, normal: FloatArray, centre: FloatArray) -> FloatArray:
+    """Displacement along ``normal`` (k, 3) at points (k, 3) per twist about ``centre``: (k, 6).
+
+    n' [I, -[p - c]x] (METHOD 1.4).
+    """
+    return np.hstack([normal, np.cross(xyz - centre, normal)])
+
+
+def along(direction: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Variance (k,) along the rows of ``direction`` (k, d) of what has the covariance (d, d)."""
+    return np.asarray(np.einsum("ki,ij,kj->k", direction, covariance, direction))

@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 from scipy import ndimage
 
+from loda_pdal.kernels.lod_pooling import MAD_TO_STD
 from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, Int64Array, IntArray
 from loda_pdal.model.grid import Lattice, cells_of
 from loda_pdal.model.groups import Groups, consecutive, unique_rows
@@ -16,6 +17,7 @@ from loda_pdal.model.labels import ChangeLabel
 from loda_pdal.model.lod_grid import LodGrid
 from loda_pdal.model.pair import Pair
 from loda_pdal.params import GroundChangeParams
+from loda_pdal.stages.lod import SMALL_SAMPLE
 
 SPOTS_PER_TILE = 4
 """A tile is compared on so many spots along each edge, so that only ground seen by both epochs in one place counts."""
@@ -118,7 +120,7 @@ def ground_changes(
     if len(tiles) == 0:
         nothing = np.zeros(0)
         return GroundChanges(params.cell_m, tiles, nothing, nothing, np.zeros(0, np.uint8), np.zeros(0, np.int32), [])
-    dz, lod95 = _elevation_change(ground, lod, tiles, params.cell_m)
+    dz, lod95 = _elevation_change(ground, lod, tiles, params)
     is_changed = (np.abs(dz) > params.min_dz_m) & (np.abs(dz) > params.lod_factor * lod95)
     region = _regions(tiles, np.where(is_changed, np.sign(dz), 0.0), params)
     label = np.where(np.isnan(dz), ChangeLabel.UNDETERMINED, ChangeLabel.UNCHANGED)
@@ -128,10 +130,14 @@ def ground_changes(
 
 
 def _elevation_change(
-    ground: Pair[FloatArray], lod: LodGrid, tiles: Int64Array, cell_m: float
+    ground: Pair[FloatArray], lod: LodGrid, tiles: Int64Array, params: GroundChangeParams
 ) -> tuple[FloatArray, FloatArray]:
-    """Median elevation change and LoD95 (t,), m, of each tile, over the spots where both epochs have ground."""
-    spot_m = cell_m / SPOTS_PER_TILE
+    """Median elevation change and LoD95 (t,), m, of each tile, over the spots where both epochs have ground.
+
+    In a yard seen over a fence no cell of the LoD grid holds points enough of both epochs, though sixteen spots of a
+    tile agree within centimetres: then the tile has the limit of its own median.
+    """
+    spot_m = params.cell_m / SPOTS_PER_TILE
     spots_seen = ground.map(lambda xyz: cells_of(xyz[:, :2], spot_m))
     spots = unique_rows(np.vstack([spots_seen.before, spots_seen.after]))
     lattice = Lattice.around(spots)
@@ -144,10 +150,22 @@ def _elevation_change(
     tile_lattice = Lattice.around(tiles)
     tile_idx = tile_lattice.find(tile_lattice.keys(tiles), spots // SPOTS_PER_TILE)
     groups = Groups(tile_idx, len(tiles))
-    dz = groups.median(position.after[:, 2] - position.before[:, 2])
+    rise = position.after[:, 2] - position.before[:, 2]
+    dz = groups.median(rise)
     lod95 = groups.median((limits.before + limits.after) / 2)
+    if params.has_own_limit:
+        middle = np.column_stack([(tiles + 0.5) * params.cell_m, groups.median(position.before[:, 2])])
+        up = np.tile([0.0, 0.0, 1.0], (len(tiles), 1))
+        lod95 = np.fmin(lod95, lod.limit_of(_variance_of_median(rise, groups), middle, up))
     is_enough = groups.counts >= MIN_SPOTS
     return np.where(is_enough, dz, np.nan), np.where(is_enough, lod95, np.nan)
+
+
+def _variance_of_median(values: FloatArray, groups: Groups) -> FloatArray:
+    """Variance of the median of each group of values: of pi / 2 sigma^2 / n, widened for small samples as a cell's."""
+    spread = MAD_TO_STD * groups.median(np.abs(values - groups.median(values)[groups.labels]))
+    n = np.maximum(groups.counts, 1)
+    return np.asarray(np.pi / 2 * (spread * (1.0 + SMALL_SAMPLE / n)) ** 2 / n)
 
 
 def _regions(tiles: Int64Array, sign: FloatArray, params: GroundChangeParams) -> IntArray:

@@ -9,14 +9,11 @@ from loda_pdal.kernels.lod_pooling import pool_range
 from loda_pdal.kernels.parallel import run_ranges
 from loda_pdal.model.cloud import FloatArray, Int64Array
 from loda_pdal.model.grid import cells_of
-from loda_pdal.model.lod_grid import LodGrid
+from loda_pdal.model.lod_grid import Z_95, LodGrid, along, pose_jacobian
 from loda_pdal.model.pair import Pair, at_once
 from loda_pdal.params import LodParams
 from loda_pdal.stages.drift import SURFACE_NOISE_M, drift_covariance, rigid_part
 from loda_pdal.stages.fuse import voxel_of_point
-
-Z_95 = 1.96
-"""Two-sided 95 % of the normal distribution."""
 
 SMALL_SAMPLE = 4.0
 """The noise of N points about a plane fitted to them is taken 1 + 4 / N times larger: for the freedom the plane takes,
@@ -77,15 +74,15 @@ def level_of_detection(
     widened = 1.0 + (SMALL_SAMPLE if params.small_sample else 0.0) / n
     variance = np.asarray(np.sum((sigma * widened) ** 2 / n, axis=1), dtype=np.float64)
     displacement = np.where(is_valid, offset[:, 1] - offset[:, 0], np.nan)
-    jacobian = pose_jacobian(centres, normal, centre, params.pose_term)
+    pose = _believed(covariance, params.pose_term)
+    jacobian = pose_jacobian(centres, normal, centre)
     drift = np.zeros((3, 3))
     if params.drift_term == "measured":
         is_surface = is_valid & (np.nan_to_num(sigma).max(axis=1) <= SURFACE_NOISE_M)
-        noise, along = variance[is_surface], displacement[is_surface]
-        along = along - rigid_part(along, noise, jacobian[is_surface], covariance)
-        drift = drift_covariance(along, noise, normal[is_surface], params.max_drift_m)
-    variance += np.einsum("ki,ij,kj->k", jacobian, covariance, jacobian)
-    variance += np.einsum("ki,ij,kj->k", normal, drift, normal)
+        noise, moved = variance[is_surface], displacement[is_surface]
+        moved = moved - rigid_part(moved, noise, jacobian[is_surface], pose)
+        drift = drift_covariance(moved, noise, normal[is_surface], params.max_drift_m)
+    variance += along(jacobian, pose) + along(normal, drift)
     limit = Z_95 * np.sqrt(variance)
     if params.variation == "global" and is_valid.any():
         limit = np.full(n_cells, np.median(limit[is_valid]))
@@ -100,6 +97,8 @@ def level_of_detection(
         displacement=displacement.astype(np.float32),
         low_observability_m=params.low_observability_m,
         drift=drift,
+        pose=pose,
+        centre=centre,
     )
 
 
@@ -111,11 +110,9 @@ def _occupied_cells(xyz: FloatArray, cell_m: float) -> Int64Array:
     return cells_of(xyz[one_of_cell], cell_m)
 
 
-def pose_jacobian(xyz: FloatArray, normal: FloatArray, centre: FloatArray, pose_term: str) -> FloatArray:
-    """Displacement along ``normal`` (k, 3) at points (k, 3) per twist about ``centre``: (k, 6).
-
-    ``full`` is n' [I, -[p - c]x] (METHOD 1.4); ``translation``, the paper's, leaves the turn out; ``none`` is zero.
-    """
-    turn = np.cross(xyz - centre, normal)
-    has_shift, has_turn = float(pose_term != "none"), float(pose_term == "full")
-    return np.hstack([normal * has_shift, turn * has_turn])
+def _believed(covariance: FloatArray, pose_term: str) -> FloatArray:
+    """The part of the pose covariance (6, 6) that enters the limit: all of it, the translation's (paper), or none."""
+    n = {"full": 6, "translation": 3, "none": 0}[pose_term]
+    believed = np.zeros((6, 6))
+    believed[:n, :n] = covariance[:n, :n]
+    return believed
