@@ -15,6 +15,7 @@ from loda_pdal.benchmark.commands import bench
 from loda_pdal.benchmark.evaluate import interval, run_suite, sources_digest
 from loda_pdal.benchmark.simulate import SimulationOptions
 from loda_pdal.benchmark.suites import MODELS, SEEN, SIZES, SuiteBlock, pieces, split_of_made, split_of_piece, streets
+from loda_pdal.benchmark.truth import Truth
 from loda_pdal.model.errors import InputError
 from loda_pdal.params import Parameters
 
@@ -111,6 +112,15 @@ def test_a_suite_is_simulated_run_scored_and_taken_up_again(folder: Path, one_bl
     other = CliRunner().invoke(bench, [*arguments[:-1], "--set", "changes.use_lod=false"])
     assert "simulating" not in other.stderr and "running" in other.stderr
     assert "preset street changes.use_lod=false" in other.stdout
+
+
+def test_the_same_blocks_can_be_plain(folder: Path, one_block: SuiteBlock) -> None:
+    arguments = ["run", str(folder), "--suite", "vehicle", "--split", "train", "--plain"]
+    found = CliRunner().invoke(bench, arguments, catch_exceptions=False)
+    assert "# Suite vehicle, plain, train split: 1 blocks" in found.stdout and "| seed_3_plain |" in found.stdout
+    hard, plain = (Truth.read(folder / name / "truth.json") for name in ("seed_3", "seed_3_plain"))
+    assert split_of_made(hard.made_by) == split_of_made(plain.made_by)
+    assert not any(i.excluded == "moving" for i in plain.instances) and len(plain.instances) < len(hard.instances)
 
 
 def test_stale_blocks_are_made_again(folder: Path, one_block: SuiteBlock) -> None:

@@ -181,6 +181,7 @@ def score(run_dir: Path, truth_json: Path, as_json: bool, markdown: Path | None)
 @_split
 @click.option("--result", default="result", show_default=True, metavar="NAME", help="Folder of the results of a block.")
 @click.option("--trajectories", is_flag=True, help="Tell the method where the sensors were; most users cannot.")
+@click.option("--plain", is_flag=True, help="The same blocks without traffic, clutter, glass and the like.")
 @_written
 @click.option("--sheet", type=click.Path(path_type=Path), help="Pictures of the largest mistakes, a PNG or a folder.")
 def run(
@@ -193,6 +194,7 @@ def run(
     settings: tuple[str, ...],
     result: str,
     trajectories: bool,
+    plain: bool,
     as_json: bool,
     markdown: Path | None,
     sheet: Path | None,
@@ -215,6 +217,7 @@ def run(
         limit=limit,
         result=result,
         with_trajectories=trajectories,
+        is_plain=plain,
         say=_say,
         look=None if sheet is None else tiles.add,
     )

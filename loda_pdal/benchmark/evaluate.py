@@ -117,6 +117,7 @@ def run_suite(
     limit: int | None = None,
     result: str = "result",
     with_trajectories: bool = False,
+    is_plain: bool = False,
     say: Say = lambda text: None,
     look: Callable[[str, Path, JudgedPoints, Truth, ScoreReport], None] | None = None,
 ) -> SuiteScore:
@@ -138,13 +139,16 @@ def run_suite(
         Name of the folder of results in the folder of each block.
     with_trajectories : bool
         Tell the method where the sensors were.
+    is_plain : bool
+        The same blocks without traffic, clutter, glass and the like.
     say : callable
         Told what is going on.
     look : callable, optional
         Called for each block with its name, result folder, points, truth and scores: for pictures.
     """
     blocks = []
-    for name, block_dir in prepared_blocks(folder, suite, split, models=models, limit=limit, say=say):
+    variant = SuiteBlock.plain if is_plain else lambda block: block
+    for name, block_dir in prepared_blocks(folder, suite, split, models=models, limit=limit, say=say, variant=variant):
         seconds = _ensure_result(block_dir, result, parameters, name, say, with_trajectories)
         truth = Truth.read(block_dir / "truth.json")
         points = read_run(block_dir / result, truth, block_dir)
@@ -155,7 +159,7 @@ def run_suite(
         took = "" if seconds is None else f" in {seconds:.0f} s"
         say(f"{name}: mIoU {_per_cent(report.scores().macro_iou)}, {report.false_alarms_per_ha:.1f} alarms/ha{took}")
     told = described(parameters) + (" with trajectories" if with_trajectories else "")
-    return SuiteScore(suite, split, told, blocks)
+    return SuiteScore(f"{suite}, plain" if is_plain else suite, split, told, blocks)
 
 
 def prepared_blocks(
@@ -166,9 +170,9 @@ def prepared_blocks(
     models: Path | None = None,
     limit: int | None = None,
     say: Say,
-    has_edits: bool = True,
+    variant: Callable[[SuiteBlock], SuiteBlock] = lambda block: block,
 ) -> Iterator[tuple[str, Path]]:
-    """Name and folder of each block of a suite, or of the same without edits, simulated where it is not there yet."""
+    """Name and folder of each block of a suite, or of a variant of it, simulated where it is not there yet."""
     n_streets, n_pieces = SIZES[suite][split]
     if limit is not None:
         n_streets, n_pieces = min(n_streets, limit), min(n_pieces, max(limit - n_streets, 0))
@@ -180,12 +184,12 @@ def prepared_blocks(
         )
     candidates = pieces(suite, split, models) if n_pieces and models is not None else iter(())
     for street in streets(suite, split)[:n_streets]:
-        block = street if has_edits else street.unchanged()
+        block = variant(street)
         _ensure_block(folder, block, say)
         yield block.name, folder / block.name
     found = 0
     for piece in islice(candidates, n_pieces * MOST_CANDIDATES):
-        block = piece if has_edits else piece.unchanged()
+        block = variant(piece)
         if _ensure_block(folder, block, say):
             found += 1
             yield block.name, folder / block.name

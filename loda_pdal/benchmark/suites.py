@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from loda_pdal.benchmark.blocks import hash_share, split_of_name
-from loda_pdal.benchmark.simulate import SimulationOptions
+from loda_pdal.benchmark.simulate import Reality, SimulationOptions
 from loda_pdal.model.errors import InputError
 
 MODELS = {
@@ -68,6 +68,10 @@ class SuiteBlock:
     def unchanged(self) -> SuiteBlock:
         """The same block, surveyed twice without edits and passing traffic."""
         return replace(self, name=f"{self.name}_unchanged", options=replace(self.options, has_edits=False))
+
+    def plain(self) -> SuiteBlock:
+        """The same block without what makes it hard: the tidy street, or the city model as it is."""
+        return replace(self, name=f"{self.name}_plain", options=replace(self.options, reality=Reality.none()))
 
 
 def streets(suite: str, split: str) -> list[SuiteBlock]:

@@ -18,6 +18,7 @@ from loda_pdal.benchmark.evaluate import KnownBlock, Say, described, prepared_bl
 from loda_pdal.benchmark.metrics import markdown_table
 from loda_pdal.benchmark.protocols import judge
 from loda_pdal.benchmark.runs import judged_result
+from loda_pdal.benchmark.suites import SuiteBlock
 from loda_pdal.benchmark.truth import Truth
 from loda_pdal.io.summary import is_changed
 from loda_pdal.model.cloud import BoolArray, Int64Array
@@ -164,7 +165,9 @@ def survey_unchanged(
 ) -> Unchanged:
     """Run the method on the blocks of a split without their edits; arguments as for `run_suite`."""
     blocks = []
-    for name, block_dir in prepared_blocks(folder, suite, split, models=models, limit=limit, say=say, has_edits=False):
+    for name, block_dir in prepared_blocks(
+        folder, suite, split, models=models, limit=limit, say=say, variant=SuiteBlock.unchanged
+    ):
         known = read_block(block_dir)
         result = detect_changes(known.surveys.before, known.surveys.after, parameters)
         judged = judge(judged_result(result, known.annotation, known.truth.T_after_before), known.truth)
