@@ -45,7 +45,7 @@ MEANINGS = {
     ChangeLabel.REMOVED: "only in the earlier survey",
     ChangeLabel.INCREASED: "grew or rose",
     ChangeLabel.DECREASED: "shrank or sank",
-    ChangeLabel.UNDETERMINED: "the other survey could not have seen it",
+    ChangeLabel.UNDETERMINED: "one survey could not see it, or hardly",
     ChangeLabel.UNCHANGED: "the same within the limit of detection",
 }
 CLASS_WORDS = {ObjectClass.MOBILE: "mobile object", ObjectClass.OTHER: "other object"}
