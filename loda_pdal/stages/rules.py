@@ -33,6 +33,7 @@ class Cue(NamedTuple):
     d_typical: float
     gained_above: float
     lost_above: float
+    unshown: float
     column_rise: float
     column_scatter: float
     lod95: float
@@ -45,7 +46,6 @@ class Cue(NamedTuple):
     cut_m3: float
     grown_m3: float
     tall: float
-    n_returns: float
 
 
 class Verdict(NamedTuple):
@@ -64,12 +64,11 @@ def cues_of(evidence: Evidence, object_class: ByteArray, regions: Pair[FloatArra
         evidence.n_voxels.after > 0,
         evidence.support.before,
         evidence.support.after,
-        *(getattr(evidence, name) for name in Cue._fields[5:-7]),
+        *(getattr(evidence, name) for name in Cue._fields[5:-6]),
         np.fmax(evidence.n_voxels.before, evidence.n_voxels.after),
         *evidence.volume,
         *regions,
         np.fmax(evidence.height.before, evidence.height.after),
-        np.fmax(evidence.n_points.before, evidence.n_points.after),
     )
     return [
         Cue(ObjectClass(code), *values)
@@ -202,11 +201,14 @@ def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: Ob
             ChangeLabel.UNCHANGED,
             f"{support:.0%} of its surface is in the {other} survey too, as part of other objects",
         )
-    if cue.n_returns < params.min_returns:
+    if cue.unshown < params.min_returns:
         return Verdict(
             ChangeLabel.UNDETERMINED,
-            f"too little of it to tell: {cue.n_returns:.0f} returns (at least {params.min_returns} needed)",
+            f"too little of it to tell: {cue.unshown:.0f} returns where the {other} survey saw nothing "
+            f"(at least {params.min_returns} needed)",
         )
+    if params.raised_m > 0 and cue.tall <= params.raised_m:
+        return Verdict(ChangeLabel.UNDETERMINED, f"no higher than {cue.tall:.2f} m above the ground: a piece of it")
     return Verdict(
         label,
         f"no match in the {other} survey, which shows {support:.0%} of its surface "
