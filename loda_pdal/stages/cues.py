@@ -470,8 +470,8 @@ def _expected_points(
     """
     n = len(is_porous)
     is_both = (owner.before >= 0) & (owner.before == owner.after)
-    shared = n_raw.map(lambda points: np.bincount(owner.before[is_both], weights=points[is_both], minlength=n))
-    is_alone = is_porous & (np.bincount(owner.before[is_both], minlength=n) == 0)
+    shared = n_raw.map(lambda points: _count(owner.before, is_both, n, points))
+    is_alone = is_porous & (_count(owner.before, is_both, n) == 0)
     about = _points_about(voxels, owner, n_raw, is_alone)
     shared = shared.join(about, lambda own, near: np.where(is_alone, near, own) + 1.0)
     ratio = np.append(shared.before / shared.after, 1.0)
