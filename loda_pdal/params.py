@@ -480,8 +480,8 @@ class ChangeParams(StageParams):
     )
     min_returns: int = param(
         12,
-        "returns that a survey must have of what the other lacks: stray ones behind a window come and go; fewer are "
-        "Undetermined; 0: any",
+        "returns that a survey must have where the other saw nothing of it: stray ones behind a window come and go; "
+        "fewer are Undetermined; 0: any",
         low=0,
         high=10000,
     )
@@ -553,8 +553,8 @@ class ChangeParams(StageParams):
         is_length=True,
     )
     plant_width_m: float = param(
-        0.0,
-        "a piece of vegetation this wide on what the other survey saw bare is a plant of its own; 0: never",
+        1.5,
+        "a piece of a tree this wide on what the other survey saw bare is a plant of its own; 0: never",
         unit="m",
         low=0,
         high=100,
@@ -576,7 +576,8 @@ class ChangeParams(StageParams):
     )
     raised_m: float = param(
         0.3,
-        "what one survey calls ground shows the other's thing from this height above the lower ground model; 0: never",
+        "what one survey calls ground shows the other's thing from this height above the lower ground model, and what "
+        "rises no higher neither came nor went; 0: never",
         unit="m",
         low=0,
         high=10,
@@ -941,6 +942,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "min_returns": 0,
             "within_share": 0.0,
             "plant_rise_m": 0.0,
+            "plant_width_m": 0.0,
             "fair_tops": False,
             "thing_voxels": 0,
             "replaced_m": 0.0,

@@ -117,6 +117,45 @@ def screens(cells: Cells, is_wall: BoolArray, is_asked: BoolArray) -> BoolArray:
     return found
 
 
+def came_into_sight(cells: Cells, is_grown: Pair[BoolArray], is_gone: Pair[BoolArray]) -> BoolArray:
+    """Which walls (n,) show in one epoch alone because the building that hid them stands in the other alone.
+
+    A party wall is seen once the house beside it is gone: it begins where that stood, all the way up.
+
+    Parameters
+    ----------
+    cells : Cells
+        Voxels with their owners.
+    is_grown : Pair of (n,) bool
+        Buildings that are asked for, which show more before, or more after.
+    is_gone : Pair of (n,) bool
+        Buildings that only the before, or only the after epoch has.
+    """
+    voxels, n = cells.voxels, len(is_grown.before)
+    found = np.zeros(n, np.bool_)
+    for own, is_new, grown, other, gone in (
+        (cells.owner.before, cells.is_lost, is_grown.before, cells.owner.after, is_gone.after),
+        (cells.owner.after, cells.is_gained, is_grown.after, cells.owner.before, is_gone.before),
+    ):
+        asked = np.flatnonzero(is_new & np.append(grown, False)[own])
+        hiding = np.flatnonzero(np.append(gone, False)[other])
+        if len(asked) == 0 or len(hiding) == 0:
+            continue
+        beside, _ = nearest(voxels.centre[hiding], voxels.centre[asked], _BESIDE_M)
+        levels = np.column_stack([own[asked], voxels.cell[asked, 2]]).astype(np.int64)
+        level, place = np.unique(levels, axis=0, return_inverse=True)
+        is_beside = np.bincount(place.ravel(), weights=beside >= 0, minlength=len(level)) > 0
+        owner = level[:, 0]
+        found |= np.bincount(owner, weights=is_beside, minlength=n) > _MOST_LEVELS * np.bincount(owner, minlength=n)
+    return found
+
+
+_BESIDE_M = 1.5
+"""A wall that came into sight begins no farther from what hid it."""
+
+_MOST_LEVELS = 0.5
+"""Share of its levels at which it does."""
+
 _DEPTH_M = 1.5
 """A wall this far behind what stands before it is looked for."""
 

@@ -15,15 +15,16 @@ from loda_pdal.model.labels import ChangeLabel, ObjectClass
 from loda_pdal.model.lod_grid import LodGrid
 from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams, ConfidenceParams, ObservabilityParams
-from loda_pdal.stages.annexes import are_built_on, screens
+from loda_pdal.stages.annexes import are_built_on, came_into_sight, screens
 from loda_pdal.stages.cast import FOLIAGE_M, Cast
 from loda_pdal.stages.confidence import calibrated
 from loda_pdal.stages.correspondence import rank_by_place
-from loda_pdal.stages.cues import Evidence, Surface, Voxels, median_rise, sample_voxels, share_beneath, weigh
+from loda_pdal.stages.cues import Cells, Evidence, Surface, Voxels, median_rise, sample_voxels, share_beneath, weigh
 from loda_pdal.stages.faces import face_offset
 from loda_pdal.stages.observability import Coverage
 from loda_pdal.stages.parts import largest_regions, split_parts
 from loda_pdal.stages.rules import (
+    NEXT_TO_NOTHING,
     Cue,
     Verdict,
     changed_houses,
@@ -33,6 +34,7 @@ from loda_pdal.stages.rules import (
     is_within,
     raw_score,
     screen,
+    uncovered,
     verdict_of,
 )
 from loda_pdal.stages.things import split_things
@@ -126,9 +128,12 @@ def decide_changes(
         for cue, apart, part in zip(cues, cast.is_apart.tolist(), is_part.tolist(), strict=True)
     ]
     has_walls = not params.fills_buildings
-    is_screen = screens(cells, cast.object_class == ObjectClass.BUILDING, cast.is_extension & has_walls)
+    is_building = cast.object_class == ObjectClass.BUILDING
+    is_screen = screens(cells, is_building, cast.is_extension & has_walls)
     for i in np.flatnonzero(cast.is_extension).tolist():
         verdicts[i] = screen(verdicts[i]) if is_screen[i] else extension(verdicts[i])
+    if params.needs_sight:
+        verdicts = _without_uncovered(verdicts, cells, is_building, evidence.n_voxels)
     raw = np.array(
         [
             raw_score(cue, v, apart, params, confidence)
@@ -153,6 +158,21 @@ def decide_changes(
         reason=tuple(v.reason for v in verdicts),
         evidence=evidence,
     )
+
+
+def _without_uncovered(
+    verdicts: list[Verdict], cells: Cells, is_building: BoolArray, n_voxels: Pair[FloatArray]
+) -> list[Verdict]:
+    """The verdicts, those on walls that only came into sight or went out of it Unchanged."""
+    label = np.array([v.label for v in verdicts], dtype=np.uint8)
+    of_buildings = np.where(is_building, label, ChangeLabel.UNDETERMINED)
+    changed = Pair(
+        (of_buildings == ChangeLabel.DECREASED) & (n_voxels.after <= NEXT_TO_NOTHING * n_voxels.before),
+        (of_buildings == ChangeLabel.INCREASED) & (n_voxels.before <= NEXT_TO_NOTHING * n_voxels.after),
+    )
+    gone = Pair(of_buildings == ChangeLabel.REMOVED, of_buildings == ChangeLabel.ADDED)
+    is_uncovered = came_into_sight(cells, changed, gone)
+    return [uncovered(v) if found else v for v, found in zip(verdicts, is_uncovered.tolist(), strict=True)]
 
 
 def _divided(surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, params: ChangeParams) -> Cast:

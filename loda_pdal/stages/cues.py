@@ -170,8 +170,8 @@ class Cells:
     is_seen : Pair of (c,) bool
         Whether that epoch saw the voxel's column, and would have hit what the other epoch shows there; of solid things
         it must show something beneath the voxel, and nothing of the same object above it.
-    is_measured : Pair of (c,) bool
-        Whether that epoch's owner has raw points there: not in what was filled in beneath a roof.
+    n_raw : Pair of (c,) float64
+        Raw points of that epoch's owner there; none in what was filled in beneath a roof.
     odds : Pair of (c,) float64
         How likely that epoch's sampling was to meet what the other epoch shows there; 1 where that is not weighed.
     """
@@ -179,8 +179,13 @@ class Cells:
     voxels: Voxels
     owner: Pair[IntArray]
     is_seen: Pair[BoolArray]
-    is_measured: Pair[BoolArray]
+    n_raw: Pair[FloatArray]
     odds: Pair[FloatArray]
+
+    @property
+    def is_measured(self) -> Pair[BoolArray]:
+        """Whether each epoch's owner has raw points there."""
+        return self.n_raw.map(lambda points: points > 0)
 
     @property
     def is_near(self) -> Pair[BoolArray]:
@@ -243,6 +248,8 @@ class Evidence:
     gained, lost
         Voxels that only the after, or only the before epoch has, where the other could have seen them;
         ``gained_above`` and ``lost_above`` are those beyond the other epoch's top.
+    unshown
+        Raw points in the gained or lost voxels, of the epoch that has more of them.
     column_rise, column_scatter : m
         Median change of the top over the columns that both epochs occupy, and what lies between the quartiles of these
         changes; NaN with fewer than eight of them.
@@ -277,6 +284,7 @@ class Evidence:
     d_typical: FloatArray
     gained_above: FloatArray
     lost_above: FloatArray
+    unshown: FloatArray
     column_rise: FloatArray
     column_scatter: FloatArray
     lod95: FloatArray
@@ -360,12 +368,13 @@ def cells_with_owners(
     owner, n_raw = (Pair(*np.ascontiguousarray(values.T)) for values in (holder, points))
     is_seen = voxels.is_covered
     odds = n_raw.map(np.ones_like)
+    is_porous = np.ones(n, np.bool_) if is_solid is None else ~is_solid
     if params.min_expected_points > 0:
         within = owner.join(n_raw, lambda side, points: _with_beside(voxels.beside, side, points))
-        expected = _expected_points(owner, n_raw, within, n)
+        expected = _expected_points(voxels, owner, n_raw, within, is_porous)
         is_seen = is_seen.join(expected, lambda seen, points: seen & (points >= params.min_expected_points))
     if params.weighs_sampling:
-        odds = _expected_points(owner, n_raw, n_raw, n).map(lambda points: 1.0 - np.exp(-points))
+        odds = _expected_points(voxels, owner, n_raw, n_raw, is_porous).map(lambda points: 1.0 - np.exp(-points))
     if is_solid is not None and is_solid.any():
         own = owner.swapped  # what each epoch should have seen is the other's
         is_hidden = Pair(
@@ -374,7 +383,7 @@ def cells_with_owners(
         )
         solid = own.map(lambda side: np.append(is_solid, False)[side])
         is_seen = is_seen.join(solid.join(is_hidden, np.logical_and), lambda seen, hidden: seen & ~hidden)
-    return Cells(voxels, owner, is_seen, n_raw.map(lambda points: points > 0), odds)
+    return Cells(voxels, owner, is_seen, n_raw, odds)
 
 
 def _is_over(
@@ -452,20 +461,52 @@ def _with_beside(beside: Int64Array, owner: IntArray, n_raw: FloatArray) -> Floa
 
 
 def _expected_points(
-    owner: Pair[IntArray], n_raw: Pair[FloatArray], n_there: Pair[FloatArray], n: int
+    voxels: Voxels, owner: Pair[IntArray], n_raw: Pair[FloatArray], n_there: Pair[FloatArray], is_porous: BoolArray
 ) -> Pair[FloatArray]:
     """Raw points (c,) that each epoch should have where the other has ``n_there`` of an object, were it unchanged.
 
-    By the ratio of both epochs' points ``n_raw`` in the voxels of the object that both occupy; an object without such
-    voxels is expected to be sampled alike by both.
+    By the ratio of both epochs' points ``n_raw`` in the voxels of the object that both occupy; of an object without
+    such voxels, in those about it that both occupy, whosever they are.
     """
+    n = len(is_porous)
     is_both = (owner.before >= 0) & (owner.before == owner.after)
-    shared = n_raw.map(lambda points: np.bincount(owner.before[is_both], weights=points[is_both], minlength=n) + 1.0)
+    shared = n_raw.map(lambda points: _count(owner.before, is_both, n, points))
+    is_alone = is_porous & (_count(owner.before, is_both, n) == 0)
+    about = _points_about(voxels, owner, n_raw, is_alone)
+    shared = shared.join(about, lambda own, near: np.where(is_alone, near, own) + 1.0)
     ratio = np.append(shared.before / shared.after, 1.0)
     return Pair(
         np.where(owner.after >= 0, n_there.after * ratio[owner.after], np.inf),
         np.where(owner.before >= 0, n_there.before / ratio[owner.before], np.inf),
     )
+
+
+def _points_about(
+    voxels: Voxels, owner: Pair[IntArray], n_raw: Pair[FloatArray], is_asked: BoolArray
+) -> Pair[FloatArray]:
+    """Raw points (n,) of each epoch about the objects asked for (n,), in voxels that something occupies in both: what
+    the sampling of the place is. Voxels count once for each voxel of the object that they are near to."""
+    n = len(is_asked)
+    is_both = np.flatnonzero((owner.before >= 0) & (owner.after >= 0))
+    asked = np.append(is_asked, False)
+    member = [np.flatnonzero(asked[side]) for side in owner]
+    if len(is_both) == 0 or not any(len(side) for side in member):
+        return Pair(np.zeros(n), np.zeros(n))
+    place = cells_of(voxels.centre, _ABOUT_M)
+    lattice = Lattice.around(place)
+    keys, cell = np.unique(lattice.keys(place[is_both]), return_inverse=True)
+    counts = [np.append(np.bincount(cell, weights=side[is_both], minlength=len(keys)), 0.0) for side in n_raw]
+    total = np.zeros((2, n))
+    for side, inside in zip(owner, member, strict=True):
+        for step in np.ndindex(3, 3, 3):
+            found = lattice.find(keys, place[inside] + (np.array(step) - 1))
+            for sums, count in zip(total, counts, strict=True):
+                sums += np.bincount(side[inside], weights=count[found], minlength=n)
+    return Pair(*total)
+
+
+_ABOUT_M = 2.0
+"""What lies within a cell of this edge, or one beside it, is about a voxel."""
 
 
 def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -> Evidence:
@@ -532,6 +573,10 @@ def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -
         d_typical=np.where(is_sampled, samples.median(np.abs(displacement)), np.nan),
         gained_above=_count(own.after, cells.is_gained & _is_above(z, own.after, summit.before), n, cells.odds.before),
         lost_above=_count(own.before, cells.is_lost & _is_above(z, own.before, summit.after), n, cells.odds.after),
+        unshown=np.fmax(
+            _count(own.before, cells.is_lost, n, cells.n_raw.before),
+            _count(own.after, cells.is_gained, n, cells.n_raw.after),
+        ),
         column_rise=column_rise,
         column_scatter=column_scatter,
         lod95=Groups(owner, n).median(voxels.lod95[voxel]),

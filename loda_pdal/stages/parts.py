@@ -21,6 +21,7 @@ from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams
 from loda_pdal.stages.cues import Cells, Surface
 from loda_pdal.stages.houses import house_behind
+from loda_pdal.stages.rules import LOW_M
 
 _LINK_VOXELS = 2.9
 """Changed voxels this far apart, in voxels, are one region: the rays of a vehicle leave stripes."""
@@ -107,6 +108,7 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, 
     has_houses = (object_class == ObjectClass.BUILDING) & (params.frontage_m > 0)
     is_split = is_long | (_are_in_rows(columns_of[0], n) if params.fills_buildings else has_houses)
     is_plant = is_pair & (object_class == ObjectClass.VEGETATION) & (params.plant_width_m > 0)
+    is_plant &= np.fmax(*(Groups(side.owner, n).quantile(side.height, 0.95) for side in surfaces)) >= LOW_M
     is_split &= is_pair & ~is_plant
     own = cells.owner
     size = params.part_min_voxels, params.part_min_width_m / params.voxel_m

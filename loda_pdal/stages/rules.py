@@ -33,6 +33,7 @@ class Cue(NamedTuple):
     d_typical: float
     gained_above: float
     lost_above: float
+    unshown: float
     column_rise: float
     column_scatter: float
     lod95: float
@@ -45,7 +46,6 @@ class Cue(NamedTuple):
     cut_m3: float
     grown_m3: float
     tall: float
-    n_returns: float
 
 
 class Verdict(NamedTuple):
@@ -64,12 +64,11 @@ def cues_of(evidence: Evidence, object_class: ByteArray, regions: Pair[FloatArra
         evidence.n_voxels.after > 0,
         evidence.support.before,
         evidence.support.after,
-        *(getattr(evidence, name) for name in Cue._fields[5:-7]),
+        *(getattr(evidence, name) for name in Cue._fields[5:-6]),
         np.fmax(evidence.n_voxels.before, evidence.n_voxels.after),
         *evidence.volume,
         *regions,
         np.fmax(evidence.height.before, evidence.height.after),
-        np.fmax(evidence.n_points.before, evidence.n_points.after),
     )
     return [
         Cue(ObjectClass(code), *values)
@@ -135,7 +134,7 @@ def _new_part(cue: Cue, params: ChangeParams) -> Verdict | None:
     ):
         # bodies are within reach of the bodies beside them
         shown, most = (
-            (volume - own * params.voxel_m**3, _WITHIN_REACH) if params.fills_buildings else (theirs, _NEXT_TO_NOTHING)
+            (volume - own * params.voxel_m**3, _WITHIN_REACH) if params.fills_buildings else (theirs, NEXT_TO_NOTHING)
         )
         if volume == large and shown <= most * large:
             what = "a plant among others" if is_plant else "building in a row"
@@ -158,6 +157,11 @@ def screen(verdict: Verdict) -> Verdict:
     return Verdict(label, f"the wall behind it shows as before: {verdict.reason}")
 
 
+def uncovered(verdict: Verdict) -> Verdict:
+    """A wall that came into sight when what hid it went has not changed, nor has one that a new building hides."""
+    return Verdict(ChangeLabel.UNCHANGED, f"only hidden by the building beside it: {verdict.reason}")
+
+
 def _is_piece(cue: Cue, params: ChangeParams) -> bool:
     """Whether a part of a body that one survey alone shows is too small to be a building of its own."""
     is_body = params.fills_buildings and cue.object_class == ObjectClass.BUILDING
@@ -175,7 +179,7 @@ def changed_houses(verdicts: list[Verdict], parent: IntArray, is_of_house: BoolA
     return found
 
 
-_NEXT_TO_NOTHING = 0.2
+NEXT_TO_NOTHING = 0.2
 """Share of a part's volume that may be its neighbours' walls."""
 
 _WITHIN_REACH = 0.4
@@ -202,11 +206,14 @@ def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: Ob
             ChangeLabel.UNCHANGED,
             f"{support:.0%} of its surface is in the {other} survey too, as part of other objects",
         )
-    if cue.n_returns < params.min_returns:
+    if cue.unshown < params.min_returns:
         return Verdict(
             ChangeLabel.UNDETERMINED,
-            f"too little of it to tell: {cue.n_returns:.0f} returns (at least {params.min_returns} needed)",
+            f"too little of it to tell: {cue.unshown:.0f} returns where the {other} survey saw nothing "
+            f"(at least {params.min_returns} needed)",
         )
+    if params.raised_m > 0 and cue.tall <= params.raised_m:
+        return Verdict(ChangeLabel.UNDETERMINED, f"no higher than {cue.tall:.2f} m above the ground: a piece of it")
     return Verdict(
         label,
         f"no match in the {other} survey, which shows {support:.0%} of its surface "
@@ -260,13 +267,13 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
     is_hideable = not params.needs_sight or abs(cue.dh) < _HIDES_VOXEL * params.query_radius_m
     is_thing = params.needs_sight and cue.object_class == ObjectClass.OTHER
     rise = cue.column_rise if is_hideable and is_alike and not is_thing else math.nan
-    is_crown = params.needs_sight and is_green and cue.tall >= _LOW_M
+    is_crown = params.needs_sight and is_green and cue.tall >= LOW_M
     enough = max(gate, height_m if is_crown else height_m / 2)
     is_raised = least == 0 or cue.gained_above >= least_above or rise > enough
     is_lowered = least == 0 or cue.lost_above >= least_above or rise < -enough
     rises = has_height and dh > 0 and is_raised
     sinks = has_height and dh < 0 and is_lowered
-    is_low = is_green and cue.tall < _LOW_M
+    is_low = is_green and cue.tall < LOW_M
     if params.plant_rise_m > 0 and is_low and is_alike and abs(cue.column_rise) < _HIDES_VOXEL * params.query_radius_m:
         rises |= cue.column_rise > max(gate, params.plant_rise_m)
         sinks |= cue.column_rise < -max(gate, params.plant_rise_m)
@@ -301,7 +308,7 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
     return Verdict(ChangeLabel.UNCHANGED, f"no cue above its limit: {figures}")
 
 
-_LOW_M = 3.0
+LOW_M = 3.0
 """Plants up to here have a top of their own, and no crown that sheds its leaves."""
 
 _ALIKE = 1.2
