@@ -114,11 +114,11 @@ def house_about(part: Int64Array, columns: Int64Array, params: ChangeParams) -> 
     place = columns[near] - columns[near].min(axis=0) + 2
     is_wall = np.zeros(tuple(place.max(axis=0) + 3), np.bool_)
     is_wall[tuple(place.T)] = True
-    along, _ = _axes(is_wall, np.linalg.eigh(np.cov(close.T, bias=True))[1][:, 0])
-    s = offset @ along
+    along, inward = _axes(is_wall, np.linalg.eigh(np.cov(close.T, bias=True))[1][:, 0])
+    s, front = offset @ along, np.abs(offset @ inward) <= frontage / 2
     half = max(frontage / 2, float(np.abs((part - middle) @ along).max()))
-    before, after = (_to_end(side, half, half + frontage / 2) for side in (-s, s))
-    is_house[near] = (s >= -before) & (s <= after)
+    low, high = (_to_end(side, half, half + frontage / 2) for side in (-s[front], s[front]))
+    is_house[near] = (s >= -low) & (s <= high)
     return is_house
 
 
