@@ -37,7 +37,7 @@ from loda_pdal.stages.rules import (
     uncovered,
     verdict_of,
 )
-from loda_pdal.stages.things import split_things
+from loda_pdal.stages.things import carried_on, split_things
 from loda_pdal.stages.vehicles import ONE_VEHICLE_M, looks_like_vehicle, roughness, shape_change
 
 
@@ -202,6 +202,10 @@ def _divided(surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, p
         goes_to = cast.with_more(owner, host).smooth_only(host)
         owner = owner.map(lambda side: goes_to[side])
         cast = cast.with_more(owner, host).settled(voxels)
+        is_line = np.isin(cast.object_class, (ObjectClass.VEGETATION, ObjectClass.OTHER))
+        is_line &= roughness(cast.surfaces, is_line) > FOLIAGE_M
+        goes_to = carried_on(cast.surfaces, is_line)
+        cast = cast.with_more(cast.surfaces.map(lambda side: goes_to[side.owner]), host[:0]).settled(voxels)
         cells = cast.cells(voxels, params)
     if params.find_parts:
         cast = cast.with_parts(split_parts(cells, cast.surfaces, cast.object_class, params)).settled(voxels)

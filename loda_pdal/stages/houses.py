@@ -27,6 +27,9 @@ _LOWER_M = 1.0
 _LARGER = 2.0
 """A house covers at least this many times as much as what is built onto it."""
 
+_GAP = 2
+"""A row ends where more than one column along it is empty."""
+
 _WIDER = 5.0 / 3.0
 """What is wider than this many frontages may be several houses of one height."""
 
@@ -83,6 +86,49 @@ def house_behind(
     if is_larger and np.median(top[near][is_in]) > part_top + _LOWER_M:
         is_house[near] = is_in
     return is_house
+
+
+def house_about(part: Int64Array, columns: Int64Array, params: ChangeParams) -> BoolArray:
+    """Which columns (k,) of a row of houses are the house that has the part: one frontage about it, all through.
+
+    From the street the walls of the row and hardly any roof are seen. What would be left of the row beyond the frontage
+    and is less than half of one is no house, but belongs to this one.
+
+    Parameters
+    ----------
+    part : (p, 2) int64
+        Columns of the part.
+    columns : (k, 2) int64
+        Columns of the row, the part among them or not.
+    params : ChangeParams
+        Edge of a column, width of a house in a row, and how deep one is at most.
+    """
+    is_house = np.zeros(len(columns), np.bool_)
+    reach, frontage = params.part_of_length_m / params.voxel_m, params.frontage_m / params.voxel_m
+    middle = (part.min(axis=0) + part.max(axis=0)) / 2
+    near = np.flatnonzero(np.hypot(*(columns - middle).T) <= reach)
+    offset = columns[near] - middle
+    close = offset[np.hypot(*offset.T) <= frontage]
+    if len(close) == 0:
+        return is_house
+    place = columns[near] - columns[near].min(axis=0) + 2
+    is_wall = np.zeros(tuple(place.max(axis=0) + 3), np.bool_)
+    is_wall[tuple(place.T)] = True
+    along, inward = _axes(is_wall, np.linalg.eigh(np.cov(close.T, bias=True))[1][:, 0])
+    s, front = offset @ along, np.abs(offset @ inward) <= frontage / 2
+    half = max(frontage / 2, float(np.abs((part - middle) @ along).max()))
+    low, high = (_to_end(side, half, half + frontage / 2) for side in (-s[front], s[front]))
+    is_house[near] = (s >= -low) & (s <= high)
+    return is_house
+
+
+def _to_end(s: FloatArray, half: float, most: float) -> float:
+    """How far a house reaches from its middle along ``s`` (k,): ``half``, or to the end of the row that lies no farther
+    than ``most``; all in columns."""
+    row = np.unique(np.floor(s[s >= 0]).astype(np.int64))
+    gap = np.flatnonzero(np.diff(row) > _GAP)
+    end = float(row[gap[0] if len(gap) else -1] + 1) if len(row) else 0.0
+    return max(end, half) if end <= most else half
 
 
 def _axes(is_roof: BoolArray, inward: FloatArray) -> tuple[FloatArray, FloatArray]:

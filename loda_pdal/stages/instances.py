@@ -74,6 +74,7 @@ def form_instances(
         buildings = _buildings_by_contact(xyz, height, semantics, classification, params, rules)
     else:
         buildings = _buildings_by_patches(xyz, n_raw, semantics, params)
+    buildings = _with_whole_bodies(buildings, semantics.vehicle)
     classification[buildings >= 0] = ObjectClass.BUILDING
     classification[(buildings < 0) & (classification == ObjectClass.BUILDING)] = ObjectClass.OTHER
     is_vehicle = (buildings < 0) & (semantics.vehicle >= 0)
@@ -139,6 +140,27 @@ def _buildings_by_contact(
             xyz[members], label[members], cell_m, params.roof_step_m, params.roof_least_m2 / cell_m**2
         )
     return _without_small(label, params.building_min_voxels)
+
+
+def _with_whole_bodies(buildings: IntArray, vehicle: IntArray) -> IntArray:
+    """Building of each voxel (m,) once bodies of a vehicle's size that a building holds a good share of are its own: a
+    porch is as high as a storey and hangs on to the house there, and one body is one thing.
+
+    ``vehicle`` (m,) is the body of each voxel, -1 none.
+    """
+    is_of_both = (buildings >= 0) & (vehicle >= 0)
+    if not is_of_both.any():
+        return buildings
+    n = int(vehicle.max()) + 1
+    is_held = Groups(vehicle, n).share(buildings >= 0) >= _HELD_SHARE
+    body, house, _ = favourites(vehicle[is_of_both], buildings[is_of_both])
+    host = np.full(n + 1, -1, dtype=np.int32)
+    host[body[is_held[body]]] = house[is_held[body]]
+    return np.where(buildings < 0, host[vehicle], buildings)
+
+
+_HELD_SHARE = 0.2
+"""Share of a body that a building holds, from which on it holds all of it."""
 
 
 def _with_annexes(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -20,7 +19,7 @@ from loda_pdal.model.labels import ObjectClass
 from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams
 from loda_pdal.stages.cues import Cells, Surface
-from loda_pdal.stages.houses import house_behind
+from loda_pdal.stages.houses import house_about, house_behind
 from loda_pdal.stages.rules import LOW_M
 
 _LINK_VOXELS = 2.9
@@ -323,7 +322,7 @@ def _claim(
     for part, region in in_rows:
         if top is None:
             free = np.arange(start[region.parent], start[region.parent + 1])
-            free = free[_house_about(region.columns, rows[free, 1:], params) & (part_of[free] < 0)]
+            free = free[house_about(region.columns, rows[free, 1:], params) & (part_of[free] < 0)]
         else:
             free = np.flatnonzero((part_of < 0) & has_houses[rows[:, 0]])
             free = free[house_behind(region.columns, region.top_m, rows[free, 1:], top[free], params)]
@@ -342,17 +341,3 @@ def _claim(
         np.array(is_house, dtype=np.bool_),
         np.array(is_extension, dtype=np.bool_),
     )
-
-
-def _house_about(region: Int64Array, columns: Int64Array, params: ChangeParams) -> BoolArray:
-    """Which columns (k, 2) of a row of houses are the house that has the region: one frontage of it, all through."""
-    near, reach = params.frontage_m / params.voxel_m, params.part_of_length_m / params.voxel_m
-    middle = (region.min(axis=0) + region.max(axis=0)) / 2
-    offset = columns - middle
-    x, y = offset[np.hypot(offset[:, 0], offset[:, 1]) <= near].T
-    if len(x) == 0:
-        return np.zeros(len(columns), np.bool_)
-    angle = 0.5 * math.atan2(2 * float(np.mean(x * y) - x.mean() * y.mean()), float(np.var(x) - np.var(y)))
-    along, across = np.array([math.cos(angle), math.sin(angle)]), np.array([-math.sin(angle), math.cos(angle)])
-    half = max(near / 2, float(np.abs((region - middle) @ along).max()))
-    return np.asarray((np.abs(offset @ along) <= half) & (np.abs(offset @ across) <= reach))

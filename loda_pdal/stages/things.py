@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from loda_pdal.kernels.neighbours import nearest
+from loda_pdal.model.boxes import upright_boxes
 from loda_pdal.model.cloud import BoolArray, FloatArray, IntArray
 from loda_pdal.model.grid import Lattice, cells_of
+from loda_pdal.model.groups import Groups
 from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams
 from loda_pdal.stages.cues import Cells, Surface, Voxels
@@ -97,3 +100,62 @@ def _given(surface: Surface, things: list[Region], first: int, voxel_m: float) -
     keys, number = keys[order][is_first], number[order][is_first]
     found = lattice.find(keys, np.column_stack([surface.owner.astype(np.int64), cells_of(surface.xyz[:, :2], voxel_m)]))
     return np.where(found >= 0, number[np.maximum(found, 0)], surface.owner).astype(np.int32)
+
+
+def carried_on(surfaces: Pair[Surface], is_asked: BoolArray) -> IntArray:
+    """Where the points of each object go, (n + 1,), the last those of none: what one epoch alone shows of a hedge, a
+    wall or a fence goes back to the piece of it that both show.
+
+    What carries on another thing in the same line, as wide and as high, is no thing beside it: a piece of a hedge that
+    was taken out, or planted on to its end, changes the hedge.
+
+    Parameters
+    ----------
+    surfaces : Pair of Surface
+        Points with their objects, 0 to ``n - 1``.
+    is_asked : (n,) bool
+        Objects that may be such pieces.
+    """
+    n = len(is_asked)
+    goes_to = np.append(np.arange(n), -1).astype(np.int32)
+    present = surfaces.map(lambda side: np.isin(np.arange(n), side.owner) & is_asked)
+    is_pair = np.append(present.before & present.after, False)
+    for side, own, other in zip(surfaces, present, present.swapped, strict=True):
+        piece = np.flatnonzero(np.append(own & ~other, False)[side.owner])
+        rest = np.flatnonzero(is_pair[side.owner])
+        if len(piece) == 0 or len(rest) == 0:
+            continue
+        found, _ = nearest(side.xyz[rest], side.xyz[piece], _CONTACT_M)
+        touching = np.column_stack([side.owner[piece], side.owner[rest[found]]])[found >= 0]
+        pairs, contacts = np.unique(touching, axis=0, return_counts=True)
+        order = np.argsort(contacts, kind="stable")  # the last written wins: that with most contacts
+        for own_piece, host in pairs[order[_in_line(side, pairs[order])]].tolist():
+            goes_to[own_piece] = host
+    return goes_to
+
+
+def _in_line(side: Surface, pairs: IntArray) -> BoolArray:
+    """Which pairs (p, 2) of objects lie one behind the other in a line, as wide and as high as each other."""
+    n = int(side.owner.max(initial=-1)) + 1
+    groups = Groups(side.owner, n)
+    size = upright_boxes(side.xyz, side.owner, n).size
+    top = groups.quantile(side.xyz[:, 2], 0.95)
+    members = [np.concatenate([groups.members(a), groups.members(b)]) for a, b in pairs.tolist()]
+    label = np.repeat(np.arange(len(pairs)), [len(m) for m in members])
+    both = upright_boxes(side.xyz[np.concatenate(members)], label, len(pairs)).size if len(pairs) else size[:0]
+    long, wide = np.fmax(size[:, 0], size[:, 1])[pairs], np.fmin(size[:, 0], size[:, 1])[pairs]
+    length, width = np.fmax(both[:, 0], both[:, 1]), np.fmin(both[:, 0], both[:, 1])
+    is_behind = length >= long.sum(axis=1) - _CONTACT_M
+    is_as_wide = width <= wide.max(axis=1) + _ASIDE_M
+    is_as_high = np.abs(np.diff(top[pairs], axis=1)[:, 0]) <= _ASIDE_M / 2
+    return np.asarray(is_behind & is_as_wide & is_as_high & (length >= _LINE * width))
+
+
+_CONTACT_M = 0.5
+"""What lies this near belongs together, as in the instances."""
+
+_ASIDE_M = 0.25
+"""A line's pieces end no farther aside, above or below each other: a fused point."""
+
+_LINE = 3.0
+"""A line is so many times as long as wide."""
