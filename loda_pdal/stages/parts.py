@@ -31,6 +31,9 @@ _MOST_OF = 0.5
 _LEAST_ANNEX_M = 1.0
 """What is built onto a house is longer: a drainpipe, or the stem of a tree that leans over the roof, is no annex."""
 
+_TALL = 2.0
+"""No annex is this many times as tall as it is long: that is a piece of a house that came or went."""
+
 _WIDE = 0.6
 """Storeys wider than this many frontages are those of a house of their own, and so is what is as wide either way."""
 
@@ -351,7 +354,8 @@ def _claim(
             is_storey = region.share_new < 0.5 and width_m > _WIDE * params.frontage_m
             is_onto = bool(has_houses[region.parent]) and width_m > _LEAST_ANNEX_M and not is_new and not is_storey
             is_extension.append(is_onto and top is None)  # of a body it is known once its house is found
-            if is_onto and (is_in_row if top is None else region.share_new > 0.5):
+            is_tall = region.n_voxels * params.voxel_m > _TALL * len(region.columns) * width_m
+            if is_onto and (is_in_row if top is None else region.share_new > 0.5 and not is_tall):
                 in_rows.append((len(parents), region))
             part_of[first:last][is_free] = len(parents)
             parents.append(region.parent)
