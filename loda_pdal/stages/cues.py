@@ -246,7 +246,8 @@ class Evidence:
         Share of an epoch's voxels with raw points that the other epoch shows too.
     gained, lost
         Voxels that only the after, or only the before epoch has, where the other could have seen them;
-        ``gained_above`` and ``lost_above`` are those beyond the other epoch's top.
+        ``gained_above`` and ``lost_above`` are those beyond the other epoch's top, ``gained_clear`` and ``lost_clear``
+        those in whose columns the other epoch shows the ground and nothing else.
     column_rise, column_scatter : m
         Median change of the top over the columns that both epochs occupy, and what lies between the quartiles of these
         changes; NaN with fewer than eight of them.
@@ -281,6 +282,8 @@ class Evidence:
     d_typical: FloatArray
     gained_above: FloatArray
     lost_above: FloatArray
+    gained_clear: FloatArray
+    lost_clear: FloatArray
     column_rise: FloatArray
     column_scatter: FloatArray
     lod95: FloatArray
@@ -556,6 +559,8 @@ def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -
         d_typical=np.where(is_sampled, samples.median(np.abs(displacement)), np.nan),
         gained_above=_count(own.after, cells.is_gained & _is_above(z, own.after, summit.before), n, cells.odds.before),
         lost_above=_count(own.before, cells.is_lost & _is_above(z, own.before, summit.after), n, cells.odds.after),
+        gained_clear=_count(own.after, cells.is_gained & voxels.is_clear.before, n),
+        lost_clear=_count(own.before, cells.is_lost & voxels.is_clear.after, n),
         column_rise=column_rise,
         column_scatter=column_scatter,
         lod95=Groups(owner, n).median(voxels.lod95[voxel]),
