@@ -127,7 +127,8 @@ def test_an_annex_changes_its_house_and_no_other_house_of_the_row() -> None:
 )
 def test_what_is_narrow_is_an_annex_where_it_is_low_and_stood_on_the_ground(top: float, label: str) -> None:
     house, narrow = roof((0, 10), (0, 9), 6.0), roof((10, 11.3), (2, 7), top)
-    changes = decide([(0, house)], [(0, np.concatenate([house, narrow]))], ObjectClass.BUILDING)
+    ground = roof((-10, 50), (-10, 30), 0.0)
+    changes = decide([(0, house)], [(0, np.concatenate([house, narrow]))], ObjectClass.BUILDING, ground=ground)
     assert {ChangeLabel(c).name for c in changes.label} == {label}
 
 
@@ -135,8 +136,8 @@ def test_what_is_much_taller_than_long_has_no_house_behind_it() -> None:
     row = np.concatenate([roof((6 * i, 6 * i + 6), (0, 9), 9.0 + 0.3 * (i % 2)) for i in range(5)])
     tower = roof((14, 16), (-2.2, -0.2), 7.0)
     changes = decide([(0, row)], [(0, row), (0, tower)], ObjectClass.BUILDING)
-    is_row = changes.owner.after[: len(row)]
-    assert {ChangeLabel(int(c)) for c in changes.label[is_row]} == {ChangeLabel.UNCHANGED}
+    assert sorted(changes.label) == [ChangeLabel.UNCHANGED, ChangeLabel.INCREASED]
+    assert (changes.owner.after[: len(row)] == np.argmin(changes.label)).mean() > 0.95
 
 
 def test_an_edge_that_was_sampled_once_is_no_change() -> None:
@@ -230,7 +231,7 @@ def test_a_tree_felled_beside_its_neighbour_is_removed_and_the_neighbour_stays()
 
 @pytest.mark.parametrize("code", [ObjectClass.VEGETATION, ObjectClass.OTHER])
 def test_a_piece_of_a_hedge_that_was_cut_makes_it_less(code: ObjectClass) -> None:
-    whole, rest = roof((0, 7), (5, 5.8), 1.5, 0.3), roof((0, 3), (5, 5.8), 1.5, 0.3)
+    whole, rest = roof((0, 7), (4.5, 5.4), 1.5, 0.3), roof((0, 3), (4.5, 5.4), 1.5, 0.3)
     for sides, label in (((whole, rest), ChangeLabel.DECREASED), ((rest, whole), ChangeLabel.INCREASED)):
         pair = Pair(*(surface([(0, points)], GROUND) for points in sides))
         changes = _decided(pair, [code], AERIAL.changes)
