@@ -89,6 +89,8 @@ class Voxels:
     is_over : Pair of (c,) bool
         Whether that epoch has a return in the voxel's column beneath the voxel: its rays went in there. True where no
         rule asks.
+    is_clear : Pair of (c,) bool
+        Whether that epoch has returns in the voxel's column, all of them on the ground. False where no rule asks.
     is_hidden : Pair of (c,) bool
         Whether the voxel was hidden from that epoch behind something nearer to its sensor.
     normal : (c, 3) float64
@@ -108,6 +110,7 @@ class Voxels:
     is_near: Pair[BoolArray]
     is_covered: Pair[BoolArray]
     is_over: Pair[BoolArray]
+    is_clear: Pair[BoolArray]
     is_hidden: Pair[BoolArray]
     normal: FloatArray
     displacement: FloatArray
@@ -247,7 +250,8 @@ class Evidence:
         Share of an epoch's voxels with raw points that the other epoch shows too.
     gained, lost
         Voxels that only the after, or only the before epoch has, where the other could have seen them;
-        ``gained_above`` and ``lost_above`` are those beyond the other epoch's top.
+        ``gained_above`` and ``lost_above`` are those beyond the other epoch's top, ``gained_clear`` and ``lost_clear``
+        those in whose columns the other epoch shows the ground and nothing else.
     unshown
         Raw points in the gained or lost voxels, of the epoch that has more of them.
     column_rise, column_scatter : m
@@ -285,6 +289,8 @@ class Evidence:
     gained_above: FloatArray
     lost_above: FloatArray
     unshown: FloatArray
+    gained_clear: FloatArray
+    lost_clear: FloatArray
     column_rise: FloatArray
     column_scatter: FloatArray
     lod95: FloatArray
@@ -326,7 +332,9 @@ def sample_voxels(
     always, never = np.ones(len(cell), np.bool_), np.zeros(len(cell), np.bool_)
     covered, hidden = Pair(always, always), Pair(never, never)
     is_open = xyz.map(lambda points: np.ones(len(points), np.bool_))
-    over = Pair(always, always)
+    over, clear = Pair(always, always), Pair(never, never)
+    if params.fills_buildings:
+        clear = surfaces.map(lambda surface: _is_clear(cell, columns, surface, params.voxel_m))
     if params.needs_sight or params.thing_voxels > 0:
         over = surfaces.map(lambda surface: _is_over(centre, cell, columns, surface.xyz, params.voxel_m))
     if params.needs_returns:
@@ -349,6 +357,7 @@ def sample_voxels(
         is_near=found.map(lambda idx: idx >= 0),
         is_covered=covered,
         is_over=over,
+        is_clear=clear,
         is_hidden=hidden,
         normal=normal,
         displacement=displacement,
@@ -403,6 +412,23 @@ def _is_over(
         column = lattice.find(keys, place + (np.array(step) - reach))
         lowest = np.fmin(lowest, Groups(column, len(first)).minimum(xyz[:, 2]))
     return np.asarray(np.repeat(lowest, np.diff(columns)) < centre[:, 2])
+
+
+def _is_clear(cell: Int64Array, columns: Int64Array, surface: Surface, voxel_m: float) -> BoolArray:
+    """Whether the surface's returns in the column of each voxel (c,) all lie on the ground; False where it has none."""
+    first = columns[:-1]
+    if len(first) == 0:
+        return np.zeros(len(cell), np.bool_)
+    plan = cell[first, :2]
+    lattice = Lattice.around(plan)
+    measured = surface.n_raw > 0
+    column = lattice.find(lattice.keys(plan), cells_of(surface.xyz[measured, :2], voxel_m))
+    highest = Groups(column, len(first)).maximum(surface.height[measured])
+    return np.repeat(highest < _ON_GROUND_M, np.diff(columns))
+
+
+_ON_GROUND_M = 0.5
+"""What is no higher than this above the ground is kerbs, grass and the slope of the ground."""
 
 
 def _is_beneath(voxels: Voxels, owner: IntArray, other: IntArray) -> BoolArray:
@@ -577,6 +603,8 @@ def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -
             _count(own.before, cells.is_lost, n, cells.n_raw.before),
             _count(own.after, cells.is_gained, n, cells.n_raw.after),
         ),
+        gained_clear=_count(own.after, cells.is_gained & voxels.is_clear.before, n),
+        lost_clear=_count(own.before, cells.is_lost & voxels.is_clear.after, n),
         column_rise=column_rise,
         column_scatter=column_scatter,
         lod95=Groups(owner, n).median(voxels.lod95[voxel]),

@@ -30,6 +30,9 @@ _LARGER = 2.0
 _GAP = 2
 """A row ends where more than one column along it is empty."""
 
+_NARROWER = 0.6
+"""No house is narrower than this many frontages: what looks like a party wall in it is a dormer or a chimney."""
+
 _WIDER = 5.0 / 3.0
 """What is wider than this many frontages may be several houses of one height."""
 
@@ -39,8 +42,9 @@ def house_behind(
 ) -> BoolArray:
     """Which columns (k,) are those of the house that a part is built onto.
 
-    The house reaches along the wall from one party wall to the next, and away from it through the row. Where the roofs
-    show no two party walls near each other it is one frontage, beside the wall there is or about the part.
+    The house reaches along the wall from one party wall to the next, past both ends of the part, and away from it
+    through the row. Where the roofs show no two party walls near each other it is one frontage, beside the wall there
+    is or about the part.
 
     Parameters
     ----------
@@ -74,8 +78,7 @@ def house_behind(
     along, inward = _axes(np.isfinite(roof), foot - own.mean(axis=0))
     s, t = (place - foot) @ along, (place - foot) @ inward
     is_in = (t >= -_CONTACT) & (t <= reach)
-    at = float((own.mean(axis=0) - foot) @ along)
-    left, right = _between_walls(s[is_in], t[is_in], top[near][is_in], at, frontage)
+    left, right = _between_walls(s[is_in], t[is_in], top[near][is_in], (own - foot) @ along, frontage)
     is_in &= (s >= left) & (s <= right)
     inside = np.zeros(roof.shape, np.bool_)
     inside[tuple(place[is_in].T)] = True
@@ -142,9 +145,26 @@ def _axes(is_roof: BoolArray, inward: FloatArray) -> tuple[FloatArray, FloatArra
 
 
 def _between_walls(
-    s: FloatArray, t: FloatArray, top: FloatArray, middle: float, frontage: float
+    s: FloatArray, t: FloatArray, top: FloatArray, part: FloatArray, frontage: float
 ) -> tuple[float, float]:
-    """From where to where along ``s`` the house about ``middle`` reaches; all in columns."""
+    """From where to where along ``s`` the house reaches that ``part`` (p,) along it stands against; all in columns."""
+    walls = _party_walls(s, t, top)
+    middle, half = float(part.mean()), max(float(np.ptp(part)) / 2 - 1.0, 0.0)
+    left = [*walls[walls <= middle - half].tolist()[::-1], -np.inf]
+    right = [*walls[walls >= middle + half].tolist(), np.inf]
+    while right[0] - left[0] < _NARROWER * frontage:
+        del (left if middle - left[0] <= right[0] - middle else right)[0]
+    if right[0] - left[0] <= _WIDER * frontage:
+        return left[0], right[0]
+    if min(middle - left[0], right[0] - middle) >= frontage:
+        return middle - frontage / 2, middle + frontage / 2
+    if middle - left[0] < right[0] - middle:
+        return left[0], left[0] + frontage
+    return right[0] - frontage, right[0]
+
+
+def _party_walls(s: FloatArray, t: FloatArray, top: FloatArray) -> FloatArray:
+    """Where along ``s`` the roofs step, begin or end through most of the depth of the row: ascending, in columns."""
     first = int(np.floor(s.min())) - 1
     row, band = np.floor(s).astype(np.int64) - first, np.floor((t - t.min()) / 2).astype(np.int64)
     grid = np.full((int(row.max()) + 2, int(band.max()) + 1), -np.inf)
@@ -158,11 +178,5 @@ def _between_walls(
     is_step = (rise - np.maximum(padded[:-2], padded[2:]) > _STEP_M) | (has[:-1] != has[1:])
     is_step[:-1] |= is_step[1:]  # a wall that is not parallel to the columns lies in two places
     depth = np.maximum(has[:-1].sum(axis=1), has[1:].sum(axis=1))
-    wall = first + 1.0 + np.flatnonzero(is_step.sum(axis=1) >= _WALL_SHARE * np.maximum(depth, 1))
-    left = float(wall[wall <= middle].max(initial=-np.inf))
-    right = float(wall[wall > middle].min(initial=np.inf))
-    if right - left <= _WIDER * frontage:
-        return left, right
-    if min(middle - left, right - middle) >= frontage:
-        return middle - frontage / 2, middle + frontage / 2
-    return (left, left + frontage) if middle - left < right - middle else (right - frontage, right)
+    is_wall = is_step.sum(axis=1) >= _WALL_SHARE * np.maximum(depth, 1)
+    return np.flatnonzero(is_wall).astype(np.float64) + (first + 1.0)

@@ -387,7 +387,8 @@ def _judge(
     """Class of each cluster seen as a whole, and whether it fits a vehicle's box, (n,) each."""
     n = int(cluster.max()) + 1
     groups = Groups(cluster, n)
-    is_within, is_body = vehicle_sized(xyz, cluster, groups.minimum(height), rules)
+    lowest, highest = groups.extremes(height)
+    is_within, is_body = vehicle_sized(xyz, cluster, lowest, rules, highest)
     low, high = groups.extremes(xyz[:, 2])
     fits = is_within & (high - low < rules.mobile_height_m)
     fits &= voxel_volume(xyz, cluster, n, 0.5) < rules.mobile_volume_m3

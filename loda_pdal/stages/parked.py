@@ -32,6 +32,9 @@ _LEAST_VOXELS = 40
 _FOOT_M = 0.8
 """A vehicle's lowest point lies no higher above the ground."""
 
+_BONNET_M = 1.0
+"""The lowest point of it that is seen from the air lies no higher: a bonnet, a boot."""
+
 _MARGIN_M = 1.5
 """Vans and trailers are longer than the paper's 5 m; the limit is for superpoints, this is added for whole vehicles."""
 
@@ -126,14 +129,19 @@ def _of_vehicle_size(xyz: FloatArray, height: FloatArray, gap_m: float, params: 
 
 
 def vehicle_sized(
-    xyz: FloatArray, thing: IntArray, lowest: FloatArray, params: SemanticParams
+    xyz: FloatArray, thing: IntArray, lowest: FloatArray, params: SemanticParams, top: FloatArray | None = None
 ) -> tuple[BoolArray, BoolArray]:
     """Which things (n,) are no longer and wider than a vehicle, and which are as large as one and stand on the ground.
 
-    ``thing`` (k,) of each point; ``lowest`` (n,) m, how high above the ground each begins.
+    ``thing`` (k,) of each point; ``lowest`` (n,) m, how high above the ground each begins, and for surveys from the air
+    ``top`` (n,) m, how high it reaches: there a vehicle is its roof and its bonnet, and nothing beneath is seen.
     """
     size = upright_boxes(xyz, thing, len(lowest)).size
     length, width, tall = size[:, :2].max(axis=1), size[:, :2].min(axis=1), size[:, 2]
     is_within = (length < params.mobile_length_m + _MARGIN_M) & (width < params.mobile_width_m)
-    is_body = (length > _LEAST_M[0]) & (width > _LEAST_M[1]) & (tall > _LEAST_M[2]) & (lowest < _FOOT_M)
+    is_body = (length > _LEAST_M[0]) & (width > _LEAST_M[1])
+    if top is None:
+        is_body &= (tall > _LEAST_M[2]) & (lowest < _FOOT_M)
+    else:
+        is_body &= (top > _LEAST_M[2]) & (lowest < _BONNET_M)
     return is_within, is_body

@@ -31,6 +31,9 @@ _MOST_OF = 0.5
 _LEAST_ANNEX_M = 1.0
 """What is built onto a house is longer: a drainpipe, or the stem of a tree that leans over the roof, is no annex."""
 
+_TALL = 2.0
+"""No annex is this many times as tall as it is long: that is a piece of a house that came or went."""
+
 _WIDE = 0.6
 """Storeys wider than this many frontages are those of a house of their own, and so is what is as wide either way."""
 
@@ -109,12 +112,12 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, 
     is_plant = is_pair & (object_class == ObjectClass.VEGETATION) & (params.plant_width_m > 0)
     is_plant &= np.fmax(*(Groups(side.owner, n).quantile(side.height, 0.95) for side in surfaces)) >= LOW_M
     is_split &= is_pair & ~is_plant
-    own = cells.owner
+    own, clear = cells.owner, cells.voxels.is_clear
     size = params.part_min_voxels, params.part_min_width_m / params.voxel_m
     plant = 1, params.plant_width_m / params.voxel_m
     regions = [
-        *connected_regions(cells, own, cells.is_lost, is_split, *size),
-        *connected_regions(cells, own.swapped, cells.is_gained, is_split, *size),
+        *connected_regions(cells, own, cells.is_lost, is_split, *size, is_clear=clear.after),
+        *connected_regions(cells, own.swapped, cells.is_gained, is_split, *size, is_clear=clear.before),
         *connected_regions(cells, own, cells.is_near.after, ~is_pair, *size),
         *connected_regions(cells, own.swapped, cells.is_near.before, ~is_pair, *size),
     ]
@@ -152,13 +155,15 @@ def largest_regions(cells: Cells, n: int, params: ChangeParams) -> Pair[FloatArr
         return Pair(np.zeros(n), np.zeros(n))
     everyone, width = np.ones(n, np.bool_), params.part_min_width_m / params.voxel_m
 
-    def largest(owner: Pair[IntArray], is_in: BoolArray) -> FloatArray:
+    def largest(owner: Pair[IntArray], is_in: BoolArray, is_clear: BoolArray) -> FloatArray:
         volume = np.zeros(n)
-        for region in connected_regions(cells, owner, is_in, everyone, params.part_min_voxels, width):
+        least = params.part_min_voxels
+        for region in connected_regions(cells, owner, is_in, everyone, least, width, is_clear=is_clear):
             volume[region.parent] = max(volume[region.parent], region.n_voxels * params.voxel_m**3)
         return volume
 
-    return Pair(largest(cells.owner, cells.is_lost), largest(cells.owner.swapped, cells.is_gained))
+    own, clear = cells.owner, cells.voxels.is_clear
+    return Pair(largest(own, cells.is_lost, clear.after), largest(own.swapped, cells.is_gained, clear.before))
 
 
 def dissolve(owner: Pair[IntArray], is_dissolved: BoolArray, n: int) -> tuple[Pair[IntArray], IntArray]:
@@ -217,10 +222,16 @@ _ROW_CONTACTS = 8
 
 
 def connected_regions(
-    cells: Cells, owner: Pair[IntArray], is_in: BoolArray, is_split: BoolArray, least: int, width: float = 0.0
+    cells: Cells,
+    owner: Pair[IntArray],
+    is_in: BoolArray,
+    is_split: BoolArray,
+    least: int,
+    width: float = 0.0,
+    is_clear: BoolArray | None = None,
 ) -> list[Region]:
     """Connected regions of at least ``least`` of the marked voxels (c,) within one of the objects ``is_split`` (n,), at
-    least ``width`` voxels wide in plan.
+    least ``width`` voxels wide in plan, or low roofs where the other epoch shows the ground, ``is_clear`` (c,).
 
     ``owner`` (c,) of this epoch and of the other.
     """
@@ -241,10 +252,42 @@ def connected_regions(
         plan, first = np.unique(cells.voxels.cell[members[inside], :2], axis=0, return_index=True)
         top_m = float(np.median(cells.voxels.centre[members[inside][np.append(first[1:], len(inside)) - 1], 2]))
         if width > 0 and width_of(plan) < width:
-            continue
+            tops = members[inside][np.append(first[1:], len(inside)) - 1]
+            if is_clear is None or not _is_low_roof(cells.voxels.cell, owner.before, tops, is_clear):
+                continue
         share_new = 1.0 - float(is_shared[inside[first]].mean())
         found.append(Region(int(own[inside[0]]), plan, members[inside], share_new, top_m))
     return found
+
+
+def _is_low_roof(cell: Int64Array, owner: IntArray, tops: Int64Array, is_clear: BoolArray) -> bool:
+    """Whether the highest voxels ``tops`` (k,) of a region are a level roof on what was ground, beside something higher
+    of the same object.
+
+    Edges of roofs come and go with the sampling too, but as high as the roof, and walls beneath them are met anywhere.
+    """
+    level = cell[tops, 2]
+    roof = np.median(level)
+    if len(tops) < _LEAST_ROOF or np.mean(is_clear[tops]) < _CLEAR or np.mean(np.abs(level - roof) <= 1) < _MOST:
+        return False
+    low, high = cell[tops, :2].min(axis=0) - 2, cell[tops, :2].max(axis=0) + 2
+    first, last = np.searchsorted(cell[:, 0], [low[0], high[0] + 1])
+    about = cell[first:last]
+    is_house = (owner[first:last] == owner[tops[0]]) & (about[:, 1] >= low[1]) & (about[:, 1] <= high[1])
+    return bool(np.any(is_house & (about[:, 2] > roof + _HIGHER)))
+
+
+_LEAST_ROOF = 8
+"""Columns of a roof that is narrower than parts are."""
+
+_MOST = 2.0 / 3.0
+"""Share of them that must be level."""
+
+_CLEAR = 1.0 / 3.0
+"""Share of them that must stand on what was seen to be ground: beside a wall little of it is seen."""
+
+_HIGHER = 2
+"""Voxels by which the house rises above what is built onto it."""
 
 
 def _in_column_of(cells: Cells, owner: IntArray, voxel: Int64Array, other: IntArray) -> BoolArray:
@@ -314,7 +357,8 @@ def _claim(
             is_storey = region.share_new < 0.5 and width_m > _WIDE * params.frontage_m
             is_onto = bool(has_houses[region.parent]) and width_m > _LEAST_ANNEX_M and not is_new and not is_storey
             is_extension.append(is_onto and top is None)  # of a body it is known once its house is found
-            if is_onto and (is_in_row if top is None else region.share_new > 0.5):
+            is_tall = region.n_voxels * params.voxel_m > _TALL * len(region.columns) * width_m
+            if is_onto and (is_in_row if top is None else region.share_new > 0.5 and not is_tall):
                 in_rows.append((len(parents), region))
             part_of[first:last][is_free] = len(parents)
             parents.append(region.parent)

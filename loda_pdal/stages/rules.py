@@ -34,6 +34,8 @@ class Cue(NamedTuple):
     gained_above: float
     lost_above: float
     unshown: float
+    gained_clear: float
+    lost_clear: float
     column_rise: float
     column_scatter: float
     lod95: float
@@ -297,6 +299,11 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
         if cue.grown_m3 >= cue.cut_m3:
             return Verdict(ChangeLabel.INCREASED, f"{cue.grown_m3:.0f} m3 built on in one piece: {figures}")
         return Verdict(ChangeLabel.DECREASED, f"{cue.cut_m3:.0f} m3 taken away in one piece: {figures}")
+    if cue.object_class != ObjectClass.BUILDING and cue.tall < _LOW_M:
+        piece = max(cue.gained_clear, cue.lost_clear)
+        if piece >= max(params.backing_voxels, _PIECE * cue.n_voxels, 2.0 * min(cue.gained_clear, cue.lost_clear)):
+            label = ChangeLabel.INCREASED if cue.gained_clear > cue.lost_clear else ChangeLabel.DECREASED
+            return Verdict(label, f"{piece:.0f} voxels of it stand where the other survey shows the ground: {figures}")
     limit = max(gate, params.displacement_m)
     if params.use_displacement and params.displacement_m > 0 and not is_green and abs(cue.d_perp) > limit:
         label = ChangeLabel.INCREASED if cue.gained >= cue.lost else ChangeLabel.DECREASED
@@ -307,6 +314,9 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
         return Verdict(ChangeLabel.UNCHANGED, f"what stands there is the same for all that its figures say: {figures}")
     return Verdict(ChangeLabel.UNCHANGED, f"no cue above its limit: {figures}")
 
+
+_PIECE = 0.25
+"""Share of a hedge or a fence that is no fluke of the sampling, where the other survey shows the ground instead."""
 
 LOW_M = 3.0
 """Plants up to here have a top of their own, and no crown that sheds its leaves."""
