@@ -299,7 +299,7 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
         if cue.grown_m3 >= cue.cut_m3:
             return Verdict(ChangeLabel.INCREASED, f"{cue.grown_m3:.0f} m3 built on in one piece: {figures}")
         return Verdict(ChangeLabel.DECREASED, f"{cue.cut_m3:.0f} m3 taken away in one piece: {figures}")
-    if cue.object_class != ObjectClass.BUILDING and cue.tall < _LOW_M:
+    if cue.object_class != ObjectClass.BUILDING and cue.tall < LOW_M:
         piece = max(cue.gained_clear, cue.lost_clear)
         if piece >= max(params.backing_voxels, _PIECE * cue.n_voxels, 2.0 * min(cue.gained_clear, cue.lost_clear)):
             label = ChangeLabel.INCREASED if cue.gained_clear > cue.lost_clear else ChangeLabel.DECREASED
