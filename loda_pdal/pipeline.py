@@ -399,8 +399,8 @@ def warnings_of(registration: Registration, has_ground: bool, changes: Changes, 
     unseen = np.count_nonzero(changes.label == ChangeLabel.UNDETERMINED)
     if len(changes) and unseen > _MOST_UNSEEN * len(changes):
         found.append(
-            f"{unseen} of {len(changes)} objects are Undetermined: the other survey could not have seen enough of them, or "
-            "only a few returns show them."
+            f"{unseen} of {len(changes)} objects are Undetermined: the other survey could not have seen enough of "
+            "them, or only a few returns show them."
         )
     return found
 
