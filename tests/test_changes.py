@@ -202,7 +202,60 @@ def test_what_a_few_returns_show_is_undetermined() -> None:
     assert labels(decide(surface((0, thing)), surface(), ObjectClass.OTHER)) == [ChangeLabel.REMOVED]
     found = decide(surface((0, few)), surface(), ObjectClass.OTHER)
     assert labels(found) == [ChangeLabel.UNDETERMINED]
-    assert found.reason == ("too little of it to tell: 10 returns (at least 12 needed)",)
+    assert found.reason == (
+        "too little of it to tell: 10 returns where the after survey saw nothing (at least 12 needed)",
+    )
+
+
+def test_what_rises_no_higher_than_the_ground_neither_came_nor_went() -> None:
+    slab, table = block(0, 0, 2, 2, 0.25), block(0, 0, 2, 2, 0.75)
+    found = decide(surface((0, slab)), surface(), ObjectClass.OTHER)
+    assert labels(found) == [ChangeLabel.UNDETERMINED]
+    assert found.reason == ("no higher than 0.25 m above the ground: a piece of it",)
+    assert labels(decide(surface((0, table)), surface(), ObjectClass.OTHER)) == [ChangeLabel.REMOVED]
+
+
+def test_a_party_wall_that_shows_when_the_house_beside_it_goes_has_not_changed() -> None:
+    """Of a row one house goes that hid the wall of the next, 3 m of which are seen from the street."""
+    points, normals = block(0, 0, 24, 8, 6)
+    is_front = points[:, 1] == 0
+    row = points[is_front], normals[is_front]
+    left = tuple(part[row[0][:, 0] < 16] for part in row)
+    depth, up = np.arange(0.125, 3, 0.25), np.arange(0.125, 6, 0.25)
+    wall = np.stack(np.meshgrid([16.0], depth, up, indexing="ij"), -1).reshape(-1, 3)
+    party = wall, np.tile((1, 0, 0), (len(wall), 1))
+    before, after = surface((0, row)), surface((0, joined(left, party)))
+    found = decide(before, after, ObjectClass.BUILDING)
+    assert set(labels(found)) == {ChangeLabel.UNCHANGED, ChangeLabel.REMOVED}
+    back = decide(after, before, ObjectClass.BUILDING)
+    assert [label.swapped for label in labels(found)] == labels(back)
+
+
+def crown(x: float, length: float) -> tuple[FloatArray, FloatArray]:
+    """The upper half of a box 6 m high."""
+    points, normals = block(x, 0, length, 3, 6)
+    return points[points[:, 2] > 3], normals[points[:, 2] > 3]
+
+
+@pytest.mark.parametrize(("n_raw", "expected"), [(5, ChangeLabel.ADDED), (200, ChangeLabel.UNDETERMINED)])
+def test_a_crown_is_new_only_where_the_other_survey_samples_enough_to_show_it(
+    n_raw: int, expected: ChangeLabel
+) -> None:
+    """Beside what the before survey shows with as many returns as the after survey, or with a fortieth of them."""
+    house, new = block(0, 0, 3, 3, 6), crown(4, 3)
+    before, after = surface((0, house)), surface((0, house), (1, new))
+    after = replace(after, n_raw=np.where(after.owner == 0, n_raw, 5).astype(np.int32))
+    there = decide(before, after, ObjectClass.BUILDING, ObjectClass.VEGETATION)
+    assert labels(there)[int(there.owner.after[len(house[0])])] == expected
+    back = decide(after, before, ObjectClass.BUILDING, ObjectClass.VEGETATION)
+    assert [label.swapped for label in labels(there)] == labels(back)
+
+
+def test_of_two_crowns_in_one_piece_one_goes_and_the_other_stays() -> None:
+    one, other = crown(0, 4), crown(4, 3)
+    found = decide(surface((0, joined(one, other))), surface((0, one)), ObjectClass.VEGETATION)
+    assert sorted(labels(found)) == [ChangeLabel.UNCHANGED, ChangeLabel.REMOVED]
+    assert labels(found)[int(found.owner.after[0])] == ChangeLabel.UNCHANGED
 
 
 def scaffold(x: float, y: float, length: float, top: float) -> tuple[FloatArray, FloatArray]:

@@ -94,7 +94,7 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, 
     has the house behind it taken out, wherever a row of them was cut: see `house_behind`.
 
     Plants grow together: where a piece of a plant, ``plant_width_m`` wide, stands on what the other survey saw bare, it
-    is a plant of its own, and not a growth of its neighbour.
+    is a plant of its own, and not a growth of its neighbour. Low ones that show are things: see `split_things`.
     """
     n = len(object_class)
     owner = surfaces.map(lambda surface: surface.owner)
@@ -110,7 +110,8 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, 
     has_houses = (object_class == ObjectClass.BUILDING) & (params.frontage_m > 0)
     is_split = is_long | (_are_in_rows(columns_of[0], n) if params.fills_buildings else has_houses)
     is_plant = is_pair & (object_class == ObjectClass.VEGETATION) & (params.plant_width_m > 0)
-    is_plant &= np.fmax(*(Groups(side.owner, n).quantile(side.height, 0.95) for side in surfaces)) >= LOW_M
+    if params.thing_voxels > 0:  # which looks for what is lower
+        is_plant &= np.fmax(*(Groups(side.owner, n).quantile(side.height, 0.95) for side in surfaces)) >= LOW_M
     is_split &= is_pair & ~is_plant
     own, clear = cells.owner, cells.voxels.is_clear
     size = params.part_min_voxels, params.part_min_width_m / params.voxel_m
@@ -123,8 +124,9 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, 
     ]
     if is_plant.any():
         bare = cells.bare_columns
-        regions += connected_regions(cells, own, bare.after, is_plant, *plant)
-        regions += connected_regions(cells, own.swapped, bare.before, is_plant, *plant)
+        plants = connected_regions(cells, own, bare.after, is_plant, *plant)
+        plants += connected_regions(cells, own.swapped, bare.before, is_plant, *plant)
+        regions += [region for region in plants if region.share_new > 0.5]  # not a crown that rose
     is_of_bodies = params.fills_buildings and bool(has_houses.any())
     top = _tops(surfaces, columns_of[0], params.voxel_m) if is_of_bodies else None
     columns, part, parent, is_house, is_extension = _claim(
