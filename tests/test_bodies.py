@@ -122,6 +122,24 @@ def test_an_annex_changes_its_house_and_no_other_house_of_the_row() -> None:
     assert grown.label[grown.parent[house]] == ChangeLabel.UNCHANGED
 
 
+@pytest.mark.parametrize(
+    ("top", "label"), [(2.7, "INCREASED"), (6.0, "UNCHANGED")], ids=["an annex", "the edge of the roof"]
+)
+def test_what_is_narrow_is_an_annex_where_it_is_low_and_stood_on_the_ground(top: float, label: str) -> None:
+    house, narrow = roof((0, 10), (0, 9), 6.0), roof((10, 11.3), (2, 7), top)
+    ground = roof((-10, 50), (-10, 30), 0.0)
+    changes = decide([(0, house)], [(0, np.concatenate([house, narrow]))], ObjectClass.BUILDING, ground=ground)
+    assert {ChangeLabel(c).name for c in changes.label} == {label}
+
+
+def test_what_is_much_taller_than_long_has_no_house_behind_it() -> None:
+    row = np.concatenate([roof((6 * i, 6 * i + 6), (0, 9), 9.0 + 0.3 * (i % 2)) for i in range(5)])
+    tower = roof((14, 16), (-2.2, -0.2), 7.0)
+    changes = decide([(0, row)], [(0, row), (0, tower)], ObjectClass.BUILDING)
+    assert sorted(changes.label) == [ChangeLabel.UNCHANGED, ChangeLabel.INCREASED]
+    assert (changes.owner.after[: len(row)] == np.argmin(changes.label)).mean() > 0.95
+
+
 def test_an_edge_that_was_sampled_once_is_no_change() -> None:
     house, edge = roof((0, 10), (0, 9), 6.0), roof((10, 10.8), (0, 9), 6.0)
     changes = decide([(0, house)], [(0, np.concatenate([house, edge]))], ObjectClass.BUILDING)
@@ -209,6 +227,25 @@ def test_a_tree_felled_beside_its_neighbour_is_removed_and_the_neighbour_stays()
     is_removed = changes.label[changes.owner.before[: len(left) + len(right)]] == ChangeLabel.REMOVED
     assert is_removed[len(left) :].mean() > 0.7
     assert is_removed[: len(left)].mean() < 0.1
+
+
+@pytest.mark.parametrize("code", [ObjectClass.VEGETATION, ObjectClass.OTHER])
+def test_a_piece_of_a_hedge_that_was_cut_makes_it_less(code: ObjectClass) -> None:
+    whole, rest = roof((0, 7), (4.5, 5.4), 1.5, 0.3), roof((0, 3), (4.5, 5.4), 1.5, 0.3)
+    for sides, label in (((whole, rest), ChangeLabel.DECREASED), ((rest, whole), ChangeLabel.INCREASED)):
+        pair = Pair(*(surface([(0, points)], GROUND) for points in sides))
+        changes = _decided(pair, [code], AERIAL.changes)
+        assert [ChangeLabel(c) for c in changes.label] == [label]
+        assert "shows the ground" in changes.reason[0]
+
+
+def test_what_came_beside_a_vehicle_is_a_thing_of_its_own_however_high_its_top() -> None:
+    van, stall = roof((0, 4.8), (5, 7), 2.0), roof((5.2, 8.2), (4, 8), 2.5)
+    pair = Pair(surface([(0, van)], GROUND), surface([(0, van), (0, stall)], GROUND))
+    changes = _decided(pair, [ObjectClass.OTHER], AERIAL.changes)
+    by_thing = labels_at(changes, [(0, van), (0, stall)], changes.owner.after)
+    assert "ADDED" in by_thing[1]
+    assert "UNCHANGED" in by_thing[0]
 
 
 def test_a_crown_sampled_twice_as_densely_has_not_grown() -> None:

@@ -50,6 +50,23 @@ def test_it_reaches_from_party_wall_to_party_wall(turn: float) -> None:
     assert y_high > 8.2
 
 
+def test_a_chimney_within_the_width_of_the_annex_is_no_party_wall() -> None:
+    row, at = columns_of((0, 36), (0, 9), 0.0)
+    height = STEPS[(at[:, 0] // 6).astype(int)] + 0.5 * ((at[:, 0] > 14.0) & (at[:, 0] < 14.5))
+    annex, _ = columns_of((12.5, 15.5), (-2.5, 0), 0.0)
+    found = house_behind(annex, 2.6, row, height, BODIES)
+    assert at[found, 0].min() == pytest.approx(12.0, abs=1.2)
+    assert at[found, 0].max() == pytest.approx(18.0, abs=1.2)
+
+
+def test_no_house_is_narrower_than_a_house() -> None:
+    row, at = columns_of((0, 36), (0, 9), 0.0)
+    height = STEPS[(at[:, 0] // 6).astype(int)] + 0.5 * ((at[:, 0] > 15.5) & (at[:, 0] < 16.0))
+    annex, _ = columns_of((12.5, 15.0), (-2.5, 0), 0.0)
+    found = house_behind(annex, 2.6, row, height, BODIES)
+    assert np.ptp(at[found, 0]) > 5.0
+
+
 def test_it_is_one_frontage_where_no_roof_steps() -> None:
     (x_low, x_high), _ = behind(np.full(6, 7.0), 0.3, (15.0, 18.0))
     assert x_low == pytest.approx(13.5, abs=1.0)

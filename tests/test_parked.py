@@ -8,9 +8,9 @@ import pytest
 from loda_pdal.model.cloud import FloatArray
 from loda_pdal.params import Parameters
 from loda_pdal.stages.features import eigen_features
-from loda_pdal.stages.parked import parked_vehicles
+from loda_pdal.stages.parked import parked_vehicles, vehicle_sized
 
-STREET = Parameters.preset("street")
+STREET, AERIAL = Parameters.preset("street"), Parameters.preset("aerial")
 NOISE_M = 0.015
 
 
@@ -27,6 +27,12 @@ def shell(low: tuple[float, float, float], high: tuple[float, float, float], see
     top = np.column_stack([np.repeat(x, len(y)), np.tile(y, len(x)), np.full(len(x) * len(y), z1)])
     points = np.concatenate([*ends, *sides, top])
     return points + np.random.default_rng(seed).normal(0.0, NOISE_M, points.shape)
+
+
+def roof_of(x: tuple[float, float], top: float) -> FloatArray:
+    """Points of a level surface 1.8 m wide, m, 40 cm apart."""
+    grid = np.meshgrid(np.arange(*x, 0.4), np.arange(0, 1.81, 0.4))
+    return np.column_stack([grid[0].ravel(), grid[1].ravel(), np.full(grid[0].size, top)])
 
 
 def cloud(low: tuple[float, float, float], high: tuple[float, float, float], n: int, seed: int = 1) -> FloatArray:
@@ -96,3 +102,22 @@ def test_a_preset_without_them_finds_none() -> None:
         assert np.all(vehicle == -1) and not is_solid.any()
     none, _ = parked_vehicles(CAR[:0], CAR[:0, 2], normals[:0], np.zeros(0, np.bool_), STREET.semantics)
     assert len(none) == 0
+
+
+@pytest.mark.parametrize(
+    ("thing", "is_vehicle"),
+    [
+        pytest.param(np.concatenate([roof_of((0, 1), 0.9), roof_of((1, 4), 1.4)]), True, id="bonnet and roof"),
+        pytest.param(roof_of((0, 4), 2.4), False, id="an awning"),
+        pytest.param(roof_of((0, 4), 0.6), False, id="a table"),
+        pytest.param(roof_of((0, 9), 0.9), False, id="too long"),
+    ],
+)
+def test_from_the_air_a_vehicle_is_its_roof_and_its_bonnet(thing: FloatArray, is_vehicle: bool) -> None:
+    one, height = np.zeros(len(thing), np.int32), thing[:, 2]
+    is_within, is_body = vehicle_sized(
+        thing, one, height.min(keepdims=True), AERIAL.semantics, height.max(keepdims=True)
+    )
+    assert (is_within & is_body).tolist() == [is_vehicle]
+    _, is_seen_whole = vehicle_sized(thing, one, height.min(keepdims=True), AERIAL.semantics)
+    assert not is_seen_whole.any()

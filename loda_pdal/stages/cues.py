@@ -90,8 +90,7 @@ class Voxels:
         Whether that epoch has a return in the voxel's column beneath the voxel: its rays went in there. True where no
         rule asks.
     is_clear : Pair of (c,) bool
-        Whether all that epoch's returns in the voxel's column lie on the ground, and there are some. False where no rule
-        asks.
+        Whether that epoch has returns in the voxel's column, all of them on the ground. False where no rule asks.
     is_hidden : Pair of (c,) bool
         Whether the voxel was hidden from that epoch behind something nearer to its sensor.
     normal : (c, 3) float64

@@ -40,8 +40,8 @@ def house_behind(
     """Which columns (k,) are those of the house that a part is built onto.
 
     The house reaches along the wall from one party wall to the next, past both ends of the part, and away from it
-    through the row. Where the roofs show no two party walls near each other it is one frontage, beside the wall there is
-    or about the part.
+    through the row. Where the roofs show no two party walls near each other it is one frontage, beside the wall there
+    is or about the part.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def _between_walls(
 
 
 def _party_walls(s: FloatArray, t: FloatArray, top: FloatArray) -> FloatArray:
-    """Where along ``s`` the roofs step, or begin or end, through most of the depth of the row; ascending, in columns."""
+    """Where along ``s`` the roofs step, begin or end through most of the depth of the row: ascending, in columns."""
     first = int(np.floor(s.min())) - 1
     row, band = np.floor(s).astype(np.int64) - first, np.floor((t - t.min()) / 2).astype(np.int64)
     grid = np.full((int(row.max()) + 2, int(band.max()) + 1), -np.inf)
@@ -132,4 +132,5 @@ def _party_walls(s: FloatArray, t: FloatArray, top: FloatArray) -> FloatArray:
     is_step = (rise - np.maximum(padded[:-2], padded[2:]) > _STEP_M) | (has[:-1] != has[1:])
     is_step[:-1] |= is_step[1:]  # a wall that is not parallel to the columns lies in two places
     depth = np.maximum(has[:-1].sum(axis=1), has[1:].sum(axis=1))
-    return first + 1.0 + np.flatnonzero(is_step.sum(axis=1) >= _WALL_SHARE * np.maximum(depth, 1))
+    is_wall = is_step.sum(axis=1) >= _WALL_SHARE * np.maximum(depth, 1)
+    return np.flatnonzero(is_wall).astype(np.float64) + (first + 1.0)

@@ -133,8 +133,8 @@ def vehicle_sized(
 ) -> tuple[BoolArray, BoolArray]:
     """Which things (n,) are no longer and wider than a vehicle, and which are as large as one and stand on the ground.
 
-    ``thing`` (k,) of each point; ``lowest`` (n,) m, how high above the ground each begins. With ``top`` (n,) m, how high
-    it reaches: from the air a vehicle is its roof and its bonnet, and what is beneath them is not seen.
+    ``thing`` (k,) of each point; ``lowest`` (n,) m, how high above the ground each begins, and for surveys from the air
+    ``top`` (n,) m, how high it reaches: there a vehicle is its roof and its bonnet, and nothing beneath is seen.
     """
     size = upright_boxes(xyz, thing, len(lowest)).size
     length, width, tall = size[:, :2].max(axis=1), size[:, :2].min(axis=1), size[:, 2]

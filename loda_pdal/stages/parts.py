@@ -260,9 +260,11 @@ def connected_regions(
 
 
 def _is_low_roof(cell: Int64Array, owner: IntArray, tops: Int64Array, is_clear: BoolArray) -> bool:
-    """Whether the highest voxels (k,) of the columns of a region are a level roof that stands on what was ground, against
-    something of the same object that is higher: the edges of roofs come and go too, but at their height, and the walls
-    beneath them are met anywhere."""
+    """Whether the highest voxels ``tops`` (k,) of a region are a level roof on what was ground, beside something higher
+    of the same object.
+
+    Edges of roofs come and go with the sampling too, but as high as the roof, and walls beneath them are met anywhere.
+    """
     level = cell[tops, 2]
     roof = np.median(level)
     if len(tops) < _LEAST_ROOF or np.mean(is_clear[tops]) < _CLEAR or np.mean(np.abs(level - roof) <= 1) < _MOST:
@@ -274,7 +276,7 @@ def _is_low_roof(cell: Int64Array, owner: IntArray, tops: Int64Array, is_clear: 
     return bool(np.any(is_house & (about[:, 2] > roof + _HIGHER)))
 
 
-_LEAST_ROOF = 6
+_LEAST_ROOF = 8
 """Columns of a roof that is narrower than parts are."""
 
 _MOST = 2.0 / 3.0
