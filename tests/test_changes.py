@@ -310,6 +310,31 @@ def test_a_porch_on_a_row_changes_one_frontage_of_it() -> None:
     assert x[is_changed].max() == pytest.approx(24.25, abs=0.5)
 
 
+def hedge(x: float, length: float) -> tuple[FloatArray, FloatArray]:
+    """What a survey shows of a hedge 0.75 m wide and 1.25 m high: leaves that lie anywhere and face anywhere."""
+    rng = np.random.default_rng(7)
+    n = int(60 * length)
+    facing = rng.normal(size=(n, 3))
+    points = rng.random((n, 3)) * [length, 0.75, 1.25] + [x, 0.0, 0.0]
+    return points, facing / np.linalg.norm(facing, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("kind", [ObjectClass.VEGETATION, ObjectClass.OTHER])
+@pytest.mark.parametrize("pieces", [(0, 0), (0, 1)])
+def test_a_hedge_of_which_a_part_was_taken_out_is_less_of_a_hedge(kind: ObjectClass, pieces: tuple[int, int]) -> None:
+    stays, gone = hedge(0, 2.5), hedge(2.5, 2.5)
+    before, after = surface((pieces[0], stays), (pieces[1], gone)), surface((0, stays))
+    classes = [kind] * (max(pieces) + 1)
+    assert labels(decide(before, after, *classes)) == [ChangeLabel.DECREASED]
+    assert labels(decide(after, before, *classes)) == [ChangeLabel.INCREASED]
+
+
+def test_a_bin_at_the_end_of_a_hedge_is_a_thing_of_its_own() -> None:
+    stays, box = hedge(0, 4), block(4.25, 0, 0.75, 0.75, 1.25)
+    found = decide(surface((0, joined(stays, box))), surface((0, stays)), ObjectClass.OTHER)
+    assert labels(found) == [ChangeLabel.UNCHANGED, ChangeLabel.REMOVED]
+
+
 def test_one_of_two_vehicles_in_one_piece_leaves_alone() -> None:
     one, other = block(0, 0, 4.5, 1.8, 1.5), block(5.0, 0.0, 4.5, 1.8, 1.5)
     before, after = surface((0, joined(one, other))), surface((0, one))

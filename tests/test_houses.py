@@ -1,4 +1,4 @@
-"""The house behind an annex: from party wall to party wall, whichever way the row lies."""
+"""The house behind an annex from the air, and about one from the street, whichever way the row lies."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array
 from loda_pdal.params import Parameters
-from loda_pdal.stages.houses import house_behind
+from loda_pdal.stages.houses import house_about, house_behind
 
 BODIES = Parameters.preset("aerial").changes.for_bodies()
 Bounds = FloatArray | BoolArray
@@ -88,3 +88,38 @@ def test_what_stands_apart_is_not_built_onto_anything() -> None:
     shed, _ = columns_of((12, 15), (-6, -3), 0.0)
     assert not house_behind(shed, 2.6, row, np.full(len(row), 7.0), BODIES).any()
     assert not house_behind(shed, 2.6, row[:0], np.zeros(0), BODIES).any()
+
+
+STREET = Parameters.preset("street").changes
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.35, 0.785, 1.5, -2.0])
+@pytest.mark.parametrize(
+    ("porch_m", "expected_m"),
+    [
+        ((15.0, 17.5), (13.25, 19.25)),  # a frontage about it
+        ((2.0, 4.5), (0.0, 6.25)),  # a quarter of a metre is left of the row
+        ((4.5, 7.0), (0.0, 8.75)),  # less than half a frontage is left
+        ((6.5, 9.0), (4.75, 10.75)),  # what is left may be a house
+    ],
+)
+def test_from_the_street_it_is_one_frontage_or_reaches_to_the_end_of_the_row(
+    turn: float, porch_m: tuple[float, float], expected_m: tuple[float, float]
+) -> None:
+    front, at_front = columns_of((0, 36), (0, 0.5), turn)
+    end, at_end = columns_of((0, 0.5), (0.5, 9), turn)
+    yard, at_yard = columns_of((-12, 0), (8.5, 9), turn)  # a wall behind, on beyond the end of the row
+    porch, _ = columns_of(porch_m, (-1.5, 0), turn)
+    row, at = np.concatenate([front, end, yard]), np.concatenate([at_front, at_end, at_yard])
+    found = house_about(porch, row, STREET)
+    assert at[found][:, 0].min() == pytest.approx(expected_m[0], abs=1.2)
+    assert at[found][:, 0].max() == pytest.approx(expected_m[1], abs=1.2)
+    order = np.random.default_rng(0).permutation(len(row))
+    np.testing.assert_array_equal(house_about(porch, row[order], STREET), found[order])
+
+
+def test_far_from_any_wall_there_is_no_house() -> None:
+    row, _ = columns_of((0, 36), (0, 0.5), 0.0)
+    porch, _ = columns_of((15, 17), (-12, -10), 0.0)
+    assert not house_about(porch, row, STREET).any()
+    assert not house_about(porch, row[:0], STREET).any()

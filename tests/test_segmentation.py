@@ -16,7 +16,13 @@ from loda_pdal.model.labels import ObjectClass
 from loda_pdal.params import FuseParams, Parameters
 from loda_pdal.stages.features import eigen_features
 from loda_pdal.stages.fuse import fuse_points
-from loda_pdal.stages.instances import Instances, euclidean_clusters, form_instances, split_crowns
+from loda_pdal.stages.instances import (
+    Instances,
+    euclidean_clusters,
+    form_instances,
+    split_crowns,
+    with_whole_bodies,
+)
 from loda_pdal.stages.semantics import classify, fit_planes, split_at_edges, support_area, touching
 from loda_pdal.stages.superpoints import superpoints
 
@@ -189,3 +195,15 @@ def test_cells_climb_to_the_maximum_around_them() -> None:
             ]
             best, at = max(window)
             assert highest[i, j] == (i * 7 + j if surface[i, j] == best else -at)
+
+
+def test_a_body_of_which_a_building_holds_a_fifth_is_the_buildings() -> None:
+    body = np.repeat(np.arange(-1, 3, dtype=np.int32), 10)
+    held = np.full(40, -1, dtype=np.int32)
+    held[:3], held[10:12], held[20:21], held[12:13] = 7, 4, 5, 3
+    found = with_whole_bodies(held, body)
+    np.testing.assert_array_equal(found[:10], held[:10])  # of no body
+    np.testing.assert_array_equal(found[10:20], [4, 4, 3, 4, 4, 4, 4, 4, 4, 4])
+    np.testing.assert_array_equal(found[20:], held[20:])  # a tenth, and nothing
+    np.testing.assert_array_equal(with_whole_bodies(held, np.full(40, -1, np.int32)), held)
+    assert len(with_whole_bodies(held[:0], body[:0])) == 0

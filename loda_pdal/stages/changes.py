@@ -204,10 +204,8 @@ def _divided(surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, p
         owner, host = split_things(cells, cast.surfaces, is_asked, params)
         goes_to = cast.with_more(owner, host).smooth_only(host)
         owner = owner.map(lambda side: goes_to[side])
-        cast = cast.with_more(owner, host).settled(voxels)
-        is_line = np.isin(cast.object_class, (ObjectClass.VEGETATION, ObjectClass.OTHER))
-        is_line &= roughness(cast.surfaces, is_line) > FOLIAGE_M
-        goes_to = carried_on(cast.surfaces, is_line)
+        cast = cast.with_more(owner, host)
+        goes_to = carried_on(cast.surfaces, np.isin(cast.object_class, (ObjectClass.VEGETATION, ObjectClass.OTHER)))
         cast = cast.with_more(cast.surfaces.map(lambda side: goes_to[side.owner]), host[:0]).settled(voxels)
         cells = cast.cells(voxels, params)
     if params.find_parts:

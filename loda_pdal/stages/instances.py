@@ -74,7 +74,7 @@ def form_instances(
         buildings = _buildings_by_contact(xyz, height, semantics, classification, params, rules)
     else:
         buildings = _buildings_by_patches(xyz, n_raw, semantics, params)
-    buildings = _with_whole_bodies(buildings, semantics.vehicle)
+    buildings = with_whole_bodies(buildings, semantics.vehicle)
     classification[buildings >= 0] = ObjectClass.BUILDING
     classification[(buildings < 0) & (classification == ObjectClass.BUILDING)] = ObjectClass.OTHER
     is_vehicle = (buildings < 0) & (semantics.vehicle >= 0)
@@ -142,7 +142,7 @@ def _buildings_by_contact(
     return _without_small(label, params.building_min_voxels)
 
 
-def _with_whole_bodies(buildings: IntArray, vehicle: IntArray) -> IntArray:
+def with_whole_bodies(buildings: IntArray, vehicle: IntArray) -> IntArray:
     """Building of each voxel (m,) once bodies of a vehicle's size that a building holds a good share of are its own: a
     porch is as high as a storey and hangs on to the house there, and one body is one thing.
 

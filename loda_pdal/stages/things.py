@@ -10,13 +10,15 @@ import numpy as np
 
 from loda_pdal.kernels.neighbours import nearest
 from loda_pdal.model.boxes import upright_boxes
-from loda_pdal.model.cloud import BoolArray, FloatArray, IntArray
+from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array, IntArray
 from loda_pdal.model.grid import Lattice, cells_of
 from loda_pdal.model.groups import Groups
 from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams
+from loda_pdal.stages.cast import FOLIAGE_M
 from loda_pdal.stages.cues import Cells, Surface, Voxels
 from loda_pdal.stages.parts import Region, connected_regions
+from loda_pdal.stages.vehicles import roughness
 
 _LEAST_NEW = 0.7
 """Share of a thing's columns that are its own."""
@@ -104,11 +106,11 @@ def _given(surface: Surface, things: list[Region], first: int, voxel_m: float) -
 
 
 def carried_on(surfaces: Pair[Surface], is_asked: BoolArray) -> IntArray:
-    """Where the points of each object go, (n + 1,), the last those of none: what one epoch alone shows of a hedge, a
-    wall or a fence goes back to the piece of it that both show.
+    """Where the points of each object go, (n + 1,), the last those of none: what one epoch alone shows of a hedge goes
+    back to the piece of it that both show.
 
-    What carries on another thing in the same line, as wide and as high, is no thing beside it: a piece of a hedge that
-    was taken out, or planted on to its end, changes the hedge.
+    Foliage that carries on other foliage in the same line, as wide and as high, is no thing beside it: a piece that was
+    taken out of a hedge, or planted on to its end, changes the hedge. What is smooth may be one vehicle behind another.
 
     Parameters
     ----------
@@ -121,42 +123,44 @@ def carried_on(surfaces: Pair[Surface], is_asked: BoolArray) -> IntArray:
     goes_to = np.append(np.arange(n), -1).astype(np.int32)
     present = surfaces.map(lambda side: np.isin(np.arange(n), side.owner) & is_asked)
     is_pair = np.append(present.before & present.after, False)
-    for side, own, other in zip(surfaces, present, present.swapped, strict=True):
-        piece = np.flatnonzero(np.append(own & ~other, False)[side.owner])
-        rest = np.flatnonzero(is_pair[side.owner])
-        if len(piece) == 0 or len(rest) == 0:
-            continue
-        found, _ = nearest(side.xyz[rest], side.xyz[piece], _CONTACT_M)
-        touching = np.column_stack([side.owner[piece], side.owner[rest[found]]])[found >= 0]
-        pairs, contacts = np.unique(touching, axis=0, return_counts=True)
-        order = np.argsort(contacts, kind="stable")  # the last written wins: that with most contacts
-        for own_piece, host in pairs[order[_in_line(side, pairs[order])]].tolist():
-            goes_to[own_piece] = host
+    pairs = surfaces.join(present, lambda side, own: _in_line(side, np.append(own, False) & ~is_pair, is_pair))
+    both = np.concatenate(list(pairs))
+    is_leafy = roughness(surfaces, np.isin(np.arange(n), both)) > FOLIAGE_M
+    for piece, host in both[is_leafy[both].all(axis=1)].tolist():
+        goes_to[piece] = host
     return goes_to
 
 
-def _in_line(side: Surface, pairs: IntArray) -> BoolArray:
-    """Which pairs (p, 2) of objects lie one behind the other in a line, as wide and as high as each other."""
-    n = int(side.owner.max(initial=-1)) + 1
-    groups = Groups(side.owner, n)
-    size = upright_boxes(side.xyz, side.owner, n).size
+def _in_line(side: Surface, is_piece: BoolArray, is_rest: BoolArray) -> Int64Array:
+    """Pieces and the rests that they touch, (p, 2), that lie one behind the other in a line, as wide and as high as
+    each other; of several rests that of most contacts comes last. ``is_piece`` and ``is_rest`` (n + 1,)."""
+    piece, rest = np.flatnonzero(is_piece[side.owner]), np.flatnonzero(is_rest[side.owner])
+    if len(piece) == 0 or len(rest) == 0:
+        return np.zeros((0, 2), dtype=np.int64)
+    found, _ = nearest(side.xyz[rest], side.xyz[piece], _CONTACT_M)
+    touching = np.column_stack([side.owner[piece], side.owner[rest[found]]])[found >= 0]
+    pairs, contacts = np.unique(touching.astype(np.int64), axis=0, return_counts=True)
+    pairs = pairs[np.argsort(contacts, kind="stable")]
+    n = len(is_piece) - 1
+    groups = Groups(np.where(np.isin(side.owner, pairs), side.owner, -1), n)
+    size = upright_boxes(side.xyz, groups.labels, n).size
     top = groups.quantile(side.xyz[:, 2], 0.95)
-    members = [np.concatenate([groups.members(a), groups.members(b)]) for a, b in pairs.tolist()]
-    label = np.repeat(np.arange(len(pairs)), [len(m) for m in members])
-    both = upright_boxes(side.xyz[np.concatenate(members)], label, len(pairs)).size if len(pairs) else size[:0]
-    long, wide = np.fmax(size[:, 0], size[:, 1])[pairs], np.fmin(size[:, 0], size[:, 1])[pairs]
-    length, width = np.fmax(both[:, 0], both[:, 1]), np.fmin(both[:, 0], both[:, 1])
+    member = np.concatenate([groups.members(i) for i in pairs.ravel().tolist()] or [rest[:0]])
+    label = np.repeat(np.arange(len(pairs)), groups.counts[pairs].sum(axis=1))
+    both = upright_boxes(side.xyz[member], label, len(pairs)).size
+    long, wide = size[:, :2].max(axis=1)[pairs], size[:, :2].min(axis=1)[pairs]
+    length, width = both[:, :2].max(axis=1), both[:, :2].min(axis=1)
     is_behind = length >= long.sum(axis=1) - _CONTACT_M
     is_as_wide = width <= wide.max(axis=1) + _ASIDE_M
-    is_as_high = np.abs(np.diff(top[pairs], axis=1)[:, 0]) <= _ASIDE_M / 2
-    return np.asarray(is_behind & is_as_wide & is_as_high & (length >= _LINE * width))
+    is_as_high = np.abs(top[pairs[:, 0]] - top[pairs[:, 1]]) <= _ASIDE_M / 2
+    return np.asarray(pairs[is_behind & is_as_wide & is_as_high & (length >= _LINE * width)])
 
 
 _CONTACT_M = 0.5
 """What lies this near belongs together, as in the instances."""
 
 _ASIDE_M = 0.25
-"""A line's pieces end no farther aside, above or below each other: a fused point."""
+"""Pieces of a line lie no farther aside of each other than a fused point, and their tops differ by half of that."""
 
 _LINE = 3.0
 """A line is so many times as long as wide."""
