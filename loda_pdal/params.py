@@ -641,13 +641,13 @@ class ConfidenceParams(StageParams):
     weight_shift: float = param(0.10, "weight of the centroid shift", low=0, high=1)
     weight_displacement: float = param(0.15, "weight of the normal displacement", low=0, high=1)
     calibration_unmatched: tuple[float, ...] = param(
-        (-1.36, 3.96), "logistic offset and slope of Added and Removed", low=-50, high=50
+        (-0.3, 3.28), "logistic offset and slope of Added and Removed", low=-50, high=50
     )
     calibration_changed: tuple[float, ...] = param(
-        (0.53, 1.0), "logistic offset and slope of Increased and Decreased", low=-50, high=50
+        (1.16, 0.74), "logistic offset and slope of Increased and Decreased", low=-50, high=50
     )
     calibration_unchanged: tuple[float, ...] = param(
-        (-3.35, 5.64), "logistic offset and slope of Unchanged", low=-50, high=50
+        (-3.04, 5.32), "logistic offset and slope of Unchanged", low=-50, high=50
     )
 
 
@@ -903,9 +903,9 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
         },
         "observability": {"cell_m": 2.0},
         "confidence": {
-            "calibration_unmatched": (-0.18, 2.83),
-            "calibration_changed": (1.44, 0.0),
-            "calibration_unchanged": (-2.02, 5.24),
+            "calibration_unmatched": (0.11, 2.45),
+            "calibration_changed": (1.42, 0.0),
+            "calibration_unchanged": (-2.31, 5.63),
         },
     },
     "paper": {

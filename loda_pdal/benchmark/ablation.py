@@ -139,6 +139,9 @@ OURS = tuple(
         ("Observability", "volumes compared everywhere", ("changes.visible_only=false",), None, ""),
         ("Observability", "voxels empty whatever the sampling", ("changes.min_expected_points=0",), None, ""),
         ("Change decisions", "no parts", ("changes.find_parts=false",), None, ""),
+        ("Change decisions", "things stay with what they stand beside", ("changes.thing_voxels=0",), None, ""),
+        ("Change decisions", "plants stay with what they stand beside", ("changes.plant_width_m=0",), None, ""),
+        ("Change decisions", "annexes without their house", ("changes.frontage_m=0",), None, ""),
         ("Change decisions", "buildings as sheets or bodies: the other", (), _other_bodies, ""),
         (
             "Change decisions",
