@@ -44,7 +44,10 @@ SIZES = {
 """How many streets and how many pieces of cities each split of a suite has."""
 
 FIRST_STREET = {"train": 101, "validation": 101, "test": 301}
-FIRST_PIECE = {"train": 501, "validation": 501, "test": 701}
+FIRST_PIECE = {
+    "vehicle": {"train": 501, "validation": 501, "test": 701},
+    "airborne": {"train": 501, "validation": 501, "test": 801},
+}
 """Seeds are taken in order from here on. What a release was tested on was looked at since: the next begins above it."""
 
 _CONDITIONS = 30
@@ -93,7 +96,7 @@ def pieces(suite: str, split: str, models: Path) -> Iterator[SuiteBlock]:
         )
     return (
         _block(piece_name(model, suite, seed).replace(" ", "_"), split, seed, suite, str(models / model))
-        for seed in count(FIRST_PIECE[split])
+        for seed in count(FIRST_PIECE[suite][split])
         for model in names
         if split_of_piece(model, suite, seed) == split
     )

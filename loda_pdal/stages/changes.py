@@ -202,7 +202,7 @@ def _divided(surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, p
         if params.fills_buildings:
             is_asked &= ~_is_line(cast)
         owner, host = split_things(cells, cast.surfaces, is_asked, params)
-        goes_to = cast.with_more(owner, host).smooth_only(host)
+        goes_to = cast.with_more(owner, host).smooth_only(host, must_show=params.fills_buildings)
         owner = owner.map(lambda side: goes_to[side])
         cast = cast.with_more(owner, host)
         goes_to = carried_on(cast.surfaces, np.isin(cast.object_class, (ObjectClass.VEGETATION, ObjectClass.OTHER)))
