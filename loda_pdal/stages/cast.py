@@ -73,8 +73,8 @@ class Cast:
 
     def smooth_only(self, host: IntArray, *, must_show: bool) -> IntArray:
         """Where the points of each object go, (n + 1,), the last those of none: of the last ``len(host)`` objects, the
-        rough ones that were part of a plant go back to their ``host``, and if ``must_show`` those of which too little is
-        seen to tell."""
+        rough ones that were part of a plant go back to their ``host``, and if ``must_show`` also those of which too
+        little is seen to tell."""
         n = len(self) - len(host)
         goes_to = np.append(np.arange(len(self)), -1).astype(np.int32)
         is_asked = np.arange(len(self)) >= n
