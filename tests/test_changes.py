@@ -423,6 +423,7 @@ def test_tops_that_move_alike_moved_and_others_were_met_by_chance(spread: float,
     found = decide(surface((0, there)), surface((0, lower)), ObjectClass.VEGETATION)
     assert found.evidence.column_rise[0] == pytest.approx(-0.3, abs=0.15)
     assert labels(found) == [expected]
+    assert ("in the median (limit 0.25 m)" in found.reason[0]) == (expected == ChangeLabel.DECREASED)
 
 
 def test_vegetation_grows_above_its_own_limit_only() -> None:

@@ -276,14 +276,19 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
     rises = has_height and dh > 0 and is_raised
     sinks = has_height and dh < 0 and is_lowered
     is_low = is_green and cue.tall < LOW_M
+    by_columns = False
     if params.plant_rise_m > 0 and is_low and is_alike and abs(cue.column_rise) < _HIDES_VOXEL * params.query_radius_m:
-        rises |= cue.column_rise > max(gate, params.plant_rise_m)
-        sinks |= cue.column_rise < -max(gate, params.plant_rise_m)
+        rose, fell = (sign * cue.column_rise > max(gate, params.plant_rise_m) for sign in (1, -1))
+        by_columns = (rose and not rises) or (fell and not sinks)
+        rises, sinks = rises or rose, sinks or fell
     noise = params.volume_sigmas * math.sqrt(cue.gained + cue.lost)
     has_volume = has_volume and abs(cue.gained - cue.lost) >= noise
     swells = has_volume and cue.dv_ratio > 0 and (least == 0 or cue.gained >= max(least, cue.lost))
     shrinks = has_volume and cue.dv_ratio < 0 and (least == 0 or cue.lost >= max(least, cue.gained))
     figures = _figures(cue, dh, height_m, ratio, gate)
+    if by_columns:
+        most = max(gate, params.plant_rise_m)
+        figures = f"columns {cue.column_rise:+.2f} m in the median (limit {most:.2f} m), {figures}"
     if (rises or swells) and (sinks or shrinks):
         if math.isnan(cue.rise) or cue.rise == 0:
             return Verdict(
