@@ -896,7 +896,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "plant_rise_m": 0.0,
             "fair_tops": False,
             "replaced_m": 0.2,
-            "thing_voxels": 0,
+            "thing_voxels": 4,
             "part_min_voxels": 24,
             "part_is_new_m3": 80.0,
             "use_volume": False,

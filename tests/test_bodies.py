@@ -239,6 +239,26 @@ def test_a_piece_of_a_hedge_that_was_cut_makes_it_less(code: ObjectClass) -> Non
         assert "shows the ground" in changes.reason[0]
 
 
+def test_what_came_beside_a_vehicle_is_a_thing_of_its_own_however_high_its_top() -> None:
+    van, stall = roof((0, 4.8), (5, 7), 2.0), roof((5.2, 8.2), (4, 8), 2.5)
+    pair = Pair(surface([(0, van)], GROUND), surface([(0, van), (0, stall)], GROUND))
+    changes = _decided(pair, [ObjectClass.OTHER], AERIAL.changes)
+    by_thing = labels_at(changes, [(0, van), (0, stall)], changes.owner.after)
+    assert "ADDED" in by_thing[1]
+    assert "UNCHANGED" in by_thing[0]
+
+
+def test_a_tuft_beside_a_plant_stays_with_it_and_what_is_seen_to_be_smooth_does_not() -> None:
+    bush = roof((0, 4), (4, 8), 1.5, 0.3)
+    tuft = crown(5.5, 6, 3, 40, 1.4) - np.array([0, 0, 4.5])  # leaves down to the ground, as few as a flight meets
+    stall = roof((4.2, 8), (4, 8), 1.5)
+    for beside, is_thing in ((tuft, False), (stall, True)):
+        pair = Pair(surface([(0, bush)], GROUND), surface([(0, bush), (0, beside)], GROUND))
+        changes = _decided(pair, [ObjectClass.VEGETATION], AERIAL.changes)
+        by_thing = labels_at(changes, [(0, bush), (0, beside)], changes.owner.after)
+        assert ("ADDED" in by_thing[1]) == is_thing
+
+
 def test_a_crown_sampled_twice_as_densely_has_not_grown() -> None:
     changes = vegetation([crown(5, 5, 1, 80)], [crown(5, 5, 2, 240)], AERIAL.changes)
     assert [ChangeLabel(c) for c in changes.label] == [ChangeLabel.UNCHANGED]

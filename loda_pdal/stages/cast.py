@@ -71,18 +71,21 @@ class Cast:
             self.is_extension[each],
         )
 
-    def smooth_only(self, host: IntArray) -> IntArray:
+    def smooth_only(self, host: IntArray, *, must_show: bool) -> IntArray:
         """Where the points of each object go, (n + 1,), the last those of none: of the last ``len(host)`` objects, the
-        rough ones that were part of a plant go back to their ``host``."""
+        rough ones that were part of a plant go back to their ``host``, and if ``must_show`` also those of which too
+        little is seen to tell."""
         n = len(self) - len(host)
         goes_to = np.append(np.arange(len(self)), -1).astype(np.int32)
         is_asked = np.arange(len(self)) >= n
-        is_rough: BoolArray = np.nan_to_num(roughness(self.surfaces, is_asked)) > FOLIAGE_M
+        unknown = np.inf if must_show else 0.0
+        is_rough: BoolArray = np.nan_to_num(roughness(self.surfaces, is_asked), nan=unknown) > FOLIAGE_M
         counts = np.bincount(
             np.concatenate([side.owner[side.owner >= 0] for side in self.surfaces]), minlength=len(self)
         )
-        is_rough &= counts >= _LEAST_FOLIAGE
-        is_rough &= self.object_class == ObjectClass.VEGETATION
+        is_few = counts < _LEAST_FOLIAGE
+        is_rough = is_rough | is_few if must_show else is_rough & ~is_few
+        is_rough &= is_asked & (self.object_class == ObjectClass.VEGETATION)
         goes_to[:-1][is_rough] = host[np.flatnonzero(is_rough) - n]
         return goes_to
 

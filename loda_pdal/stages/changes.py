@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from loda_pdal.model.boxes import upright_boxes
 from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, IntArray
 from loda_pdal.model.labels import ChangeLabel, ObjectClass
 from loda_pdal.model.lod_grid import LodGrid
@@ -198,8 +199,10 @@ def _divided(surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, p
             cast.surfaces, len(cast), ONE_VEHICLE_M
         )
         is_asked = cast.is_pair & (cast.object_class != ObjectClass.BUILDING) & ~is_vehicle
+        if params.fills_buildings:
+            is_asked &= ~_is_line(cast)
         owner, host = split_things(cells, cast.surfaces, is_asked, params)
-        goes_to = cast.with_more(owner, host).smooth_only(host)
+        goes_to = cast.with_more(owner, host).smooth_only(host, must_show=params.fills_buildings)
         owner = owner.map(lambda side: goes_to[side])
         cast = cast.with_more(owner, host)
         goes_to = carried_on(cast.surfaces, np.isin(cast.object_class, (ObjectClass.VEGETATION, ObjectClass.OTHER)))
@@ -232,6 +235,13 @@ def _is_replaced(
     return np.asarray(is_another)
 
 
+def _is_line(cast: Cast) -> BoolArray:
+    """Which objects (n,) are hedges, fences or walls by their plan: a piece of one is cut, and no thing of its own."""
+    xyz = np.concatenate([side.xyz for side in cast.surfaces])
+    size = upright_boxes(xyz, np.concatenate([side.owner for side in cast.surfaces]), len(cast)).size[:, :2]
+    return np.asarray(size.min(axis=1) < _LINE_M)
+
+
 def _stands_aside(cast: Cast, cues: list[Cue], is_asked: BoolArray, params: ChangeParams) -> BoolArray:
     """Which of the solid things asked for have their faces elsewhere than before."""
     aside = face_offset(cast.surfaces, is_asked)
@@ -240,6 +250,9 @@ def _stands_aside(cast: Cast, cues: list[Cue], is_asked: BoolArray, params: Chan
     is_off = aside > limit
     return is_off & (roughness(cast.surfaces, is_off) < FOLIAGE_M)
 
+
+_LINE_M = 1.5
+"""Hedges, fences and walls are narrower, and vehicles, sheds and skips are wider."""
 
 _LEAST_TOPS = 4
 """Columns that both surveys show of a vehicle, before its tops are compared."""

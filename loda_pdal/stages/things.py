@@ -52,7 +52,8 @@ def split_things(
     owner = surfaces.map(lambda surface: surface.owner)
     if not is_asked.any() or len(cells.voxels) == 0:
         return owner, np.zeros(0, dtype=np.int32)
-    height = _lowest(cells.voxels, surfaces)
+    clear = cells.voxels.is_clear.swapped  # from the air a thing is its top, and stands on what was ground
+    height = _lowest(cells.voxels, surfaces).join(clear, lambda low, on_ground: np.where(on_ground, 0.0, low))
     came = cells.is_gained & cells.voxels.is_over.before
     went = cells.is_lost & cells.voxels.is_over.after
     things = Pair(
