@@ -9,6 +9,7 @@ from scipy.special import erf
 
 from loda_pdal.model.cloud import FloatArray
 from loda_pdal.model.labels import ChangeLabel
+from loda_pdal.model.lod_grid import Z_95
 from loda_pdal.params import ConfidenceParams
 from loda_pdal.stages.ground_changes import GroundChanges
 
@@ -75,7 +76,7 @@ def ground_confidence(ground: GroundChanges, min_dz_m: float) -> FloatArray:
     a changed tile is right if the ground really moved in that direction, an unchanged one if it moved less than the
     least change that counts.
     """
-    deviation = np.maximum(ground.lod95 / 1.96, 1e-6) * math.sqrt(2.0)
+    deviation = np.maximum(ground.lod95 / Z_95, 1e-6) * math.sqrt(2.0)
     moved = 0.5 * (1.0 + erf(np.abs(ground.dz) / deviation))
     margin = (min_dz_m - np.abs(ground.dz)) / deviation
     still = 0.5 * (1.0 + erf(margin))

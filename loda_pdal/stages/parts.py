@@ -252,11 +252,11 @@ def connected_regions(
         inside = groups.members(index)
         # voxels are sorted: the last one of a column is its highest
         plan, first = np.unique(cells.voxels.cell[members[inside], :2], axis=0, return_index=True)
-        top_m = float(np.median(cells.voxels.centre[members[inside][np.append(first[1:], len(inside)) - 1], 2]))
-        if width > 0 and width_of(plan) < width:
-            tops = members[inside][np.append(first[1:], len(inside)) - 1]
-            if is_clear is None or not _is_low_roof(cells.voxels.cell, owner.before, tops, is_clear):
-                continue
+        tops = members[inside][np.append(first[1:], len(inside)) - 1]
+        is_narrow = width > 0 and width_of(plan) < width
+        if is_narrow and (is_clear is None or not _is_low_roof(cells.voxels.cell, owner.before, tops, is_clear)):
+            continue
+        top_m = float(np.median(cells.voxels.centre[tops, 2]))
         share_new = 1.0 - float(is_shared[inside[first]].mean())
         found.append(Region(int(own[inside[0]]), plan, members[inside], share_new, top_m))
     return found

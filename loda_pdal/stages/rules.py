@@ -276,9 +276,9 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
     rises = has_height and dh > 0 and is_raised
     sinks = has_height and dh < 0 and is_lowered
     is_low = is_green and cue.tall < LOW_M
-    by_columns = False
+    by_columns, least_rise = False, max(gate, params.plant_rise_m)
     if params.plant_rise_m > 0 and is_low and is_alike and abs(cue.column_rise) < _HIDES_VOXEL * params.query_radius_m:
-        rose, fell = (sign * cue.column_rise > max(gate, params.plant_rise_m) for sign in (1, -1))
+        rose, fell = cue.column_rise > least_rise, cue.column_rise < -least_rise
         by_columns = (rose and not rises) or (fell and not sinks)
         rises, sinks = rises or rose, sinks or fell
     noise = params.volume_sigmas * math.sqrt(cue.gained + cue.lost)
@@ -287,8 +287,7 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
     shrinks = has_volume and cue.dv_ratio < 0 and (least == 0 or cue.lost >= max(least, cue.gained))
     figures = _figures(cue, dh, height_m, ratio, gate)
     if by_columns:
-        most = max(gate, params.plant_rise_m)
-        figures = f"columns {cue.column_rise:+.2f} m in the median (limit {most:.2f} m), {figures}"
+        figures = f"columns {cue.column_rise:+.2f} m in the median (limit {least_rise:.2f} m), {figures}"
     if (rises or swells) and (sinks or shrinks):
         if math.isnan(cue.rise) or cue.rise == 0:
             return Verdict(
