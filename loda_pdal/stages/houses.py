@@ -1,22 +1,40 @@
 """The house behind an annex: the piece of a row, from party wall to party wall, that what changed is built onto.
 
 From the air a row of houses is one roof. Where one house ends its neighbour's roof lies a little higher or lower all
-through the depth of the row, or its wall stands back; both show in the tops of the columns.
+through the depth of the row, or its wall stands back; both show in the planes of the roofs on either side.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
 from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array
+from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams
 
-_STEP_M = 0.08
-"""Roofs that differ by this much beyond their slope, all through a row, are two; one column says nothing."""
+_STEP_M = 0.03
+"""Roofs whose planes meet with a step of this much, all through a row, are two; one place says nothing."""
 
-_WALL_SHARE = 0.5
-"""A party wall runs through at least this share of the depth of the row."""
+_ROUGH = 1.5
+"""A step is this many times what the roofs beside it are off their planes: a ridge or a dormer is none."""
+
+_SIDE = 5
+"""Columns along the row, from the one beside the wall on, that show the plane of a roof."""
+
+_CLOSE = 2
+"""Columns next to the wall whose roof is off the plane of the other side."""
+
+_BAND = 3
+"""Columns through the row that are looked at together."""
+
+_LEAST = 7
+"""Points of a plane."""
+
+_WALL_SHARE = 0.3
+"""A party wall shows in at least this share of the depth of the row."""
 
 _CONTACT = 2.1
 """Columns this far from a part, in columns, lie beside it: the wall between them has no returns of its own."""
@@ -33,18 +51,21 @@ _GAP = 2
 _NARROWER = 0.6
 """No house is narrower than this many frontages: what looks like a party wall in it is a dormer or a chimney."""
 
-_WIDER = 5.0 / 3.0
-"""What is wider than this many frontages may be several houses of one height."""
+_WIDER = 4.0
+"""What is wider than this many frontages and shows no party wall is several houses of one height."""
+
+_NEXT = 2
+"""Of the places of a wall this many columns apart one is the wall."""
 
 
 def house_behind(
-    part: Int64Array, part_top: float, columns: Int64Array, top: FloatArray, params: ChangeParams
+    part: Int64Array, part_top: float, columns: Int64Array, roofs: Pair[FloatArray], params: ChangeParams
 ) -> BoolArray:
     """Which columns (k,) are those of the house that a part is built onto.
 
     The house reaches along the wall from one party wall to the next, past both ends of the part, and away from it
     through the row. Where the roofs show no two party walls near each other it is one frontage, beside the wall there
-    is or about the part.
+    is or about the part. Party walls are looked for in the nearer half of the depth: behind it stands what likes to.
 
     Parameters
     ----------
@@ -54,8 +75,8 @@ def house_behind(
         How high it reaches; what is no lower than what it stands against is no annex.
     columns : (k, 2) int64
         Columns of the buildings about it, without those of parts.
-    top : (k,) float64, m
-        Highest point of each.
+    roofs : Pair of (k, 3) float64, m
+        Highest point of each in either epoch, NaN where there is none.
     params : ChangeParams
         Edge of a column, width of a house in a row, and how deep one is at most.
     """
@@ -67,26 +88,33 @@ def house_behind(
         return is_house
     low = np.minimum(columns[near].min(axis=0), part.min(axis=0)) - 2
     place, own = columns[near] - low, part - low
-    roof = np.full(tuple(np.maximum(place.max(axis=0), own.max(axis=0)) + 3), np.nan)
-    roof[tuple(place.T)] = top[near]
-    is_part = np.zeros(roof.shape, np.bool_)
+    is_roof = np.zeros(tuple(np.maximum(place.max(axis=0), own.max(axis=0)) + 3), np.bool_)
+    is_roof[tuple(place.T)] = True
+    is_part = np.zeros(is_roof.shape, np.bool_)
     is_part[tuple(own.T)] = True
     beside = place[ndimage.distance_transform_edt(~is_part)[tuple(place.T)] <= _CONTACT]
     if len(beside) == 0:
         return is_house
     foot = beside.mean(axis=0)
-    along, inward = _axes(np.isfinite(roof), foot - own.mean(axis=0))
-    s, t = (place - foot) @ along, (place - foot) @ inward
+    axes = np.column_stack(_axes(is_roof, foot - own.mean(axis=0)))
+    s, t = ((place - foot) @ axes).T
     is_in = (t >= -_CONTACT) & (t <= reach)
-    left, right = _between_walls(s[is_in], t[is_in], top[near][is_in], (own - foot) @ along, frontage)
+    is_front = is_in & (t <= reach / 2)
+    tops = [side[near][is_front & np.isfinite(side[near, 2])] for side in roofs]
+    of_roofs = [np.column_stack([(xyz[:, :2] / params.voxel_m - 0.5 - low - foot) @ axes, xyz[:, 2]]) for xyz in tops]
+    walls = _party_walls(s[is_front], t[is_front], of_roofs) if is_front.any() else np.zeros(0)
+    walls = walls[np.abs(walls) < np.sqrt(2.0) * reach]  # there the row ends with what was looked at
+    left, right = _between_walls(walls, (own - foot) @ axes[:, 0], frontage)
     is_in &= (s >= left) & (s <= right)
-    inside = np.zeros(roof.shape, np.bool_)
+    inside = np.zeros(is_roof.shape, np.bool_)
     inside[tuple(place[is_in].T)] = True
     piece, _ = ndimage.label(inside, np.ones((3, 3)))
     seeds = piece[tuple(beside.T)]
     is_in &= np.isin(piece[tuple(place.T)], seeds[seeds > 0])
     is_larger = np.count_nonzero(is_in) >= _LARGER * len(part)
-    if is_larger and np.median(top[near][is_in]) > part_top + _LOWER_M:
+    top = np.fmin(*(side[near[is_in], 2] for side in roofs))
+    top = top[np.isfinite(top)]
+    if is_larger and len(top) and np.median(top) > part_top + _LOWER_M:
         is_house[near] = is_in
     return is_house
 
@@ -144,11 +172,9 @@ def _axes(is_roof: BoolArray, inward: FloatArray) -> tuple[FloatArray, FloatArra
     return along, away
 
 
-def _between_walls(
-    s: FloatArray, t: FloatArray, top: FloatArray, part: FloatArray, frontage: float
-) -> tuple[float, float]:
-    """From where to where along ``s`` the house reaches that ``part`` (p,) along it stands against; all in columns."""
-    walls = _party_walls(s, t, top)
+def _between_walls(walls: FloatArray, part: FloatArray, frontage: float) -> tuple[float, float]:
+    """From where to where the house reaches that ``part`` (p,) stands against, between ``walls`` (w,) in order; all in
+    columns along the row."""
     middle, half = float(part.mean()), max(float(np.ptp(part)) / 2 - 1.0, 0.0)
     left = [*walls[walls <= middle - half].tolist()[::-1], -np.inf]
     right = [*walls[walls >= middle + half].tolist(), np.inf]
@@ -163,20 +189,83 @@ def _between_walls(
     return right[0] - frontage, right[0]
 
 
-def _party_walls(s: FloatArray, t: FloatArray, top: FloatArray) -> FloatArray:
-    """Where along ``s`` the roofs step, begin or end through most of the depth of the row: ascending, in columns."""
-    first = int(np.floor(s.min())) - 1
-    row, band = np.floor(s).astype(np.int64) - first, np.floor((t - t.min()) / 2).astype(np.int64)
-    grid = np.full((int(row.max()) + 2, int(band.max()) + 1), -np.inf)
-    np.maximum.at(grid, (row, band), top)
-    grid[np.isneginf(grid)] = np.nan
-    is_gap = np.isnan(grid[1:-1])
-    grid[1:-1][is_gap] = ((grid[:-2] + grid[2:]) / 2)[is_gap]
-    has = np.isfinite(grid)
-    rise = np.nan_to_num(np.abs(np.diff(grid, axis=0)))
-    padded = np.pad(rise, ((1, 1), (0, 0)))
-    is_step = (rise - np.maximum(padded[:-2], padded[2:]) > _STEP_M) | (has[:-1] != has[1:])
-    is_step[:-1] |= is_step[1:]  # a wall that is not parallel to the columns lies in two places
-    depth = np.maximum(has[:-1].sum(axis=1), has[1:].sum(axis=1))
-    is_wall = is_step.sum(axis=1) >= _WALL_SHARE * np.maximum(depth, 1)
+def _party_walls(s: FloatArray, t: FloatArray, roofs: list[FloatArray]) -> FloatArray:
+    """Where along ``s`` the roofs step, begin or end through much of the depth of the row: ascending, in columns.
+
+    ``s``, ``t`` (k,) of the columns and ``roofs`` (m, 3) of each epoch: s, t and m above any level. The epochs are
+    looked at apart, so that it does not matter how well they lie on each other.
+    """
+    first, begin = int(np.floor(s.min())) - 1, float(t.min())
+    shape = int(np.floor(s.max())) - first + 2, int((t.max() - begin) // _BAND) + 1
+    has = np.zeros(shape, np.bool_)
+    has[np.floor(s).astype(np.int64) - first, ((t - begin) // _BAND).astype(np.int64)] = True
+    has[1:-1] |= has[:-2] & has[2:]
+    is_end = has[:-1] != has[1:]
+    is_end[:-1] |= is_end[1:]  # a wall that is not parallel to the columns lies in two places
+    n_steps, n_asked, size = np.zeros(shape[0] - 1), np.zeros(shape[0] - 1), np.zeros(shape[0] - 1)
+    for points in roofs:
+        step, off, is_known = _steps(points - [first, begin, 0.0], shape)
+        is_step = step > np.maximum(_STEP_M, off)
+        n_steps += (is_step | (is_end & ~is_known)).sum(axis=1)
+        n_asked += (is_known | is_end).sum(axis=1)
+        size += np.where(is_step, np.minimum(step - off, _LARGE_M), 0.0).sum(axis=1)
+    share = n_steps / np.maximum(n_asked, 1)
+    score = np.where(share >= _WALL_SHARE, share + _LESS * size, 0.0)
+    is_wall = (score > 0) & (score >= ndimage.maximum_filter1d(score, 2 * _NEXT + 1))
     return np.flatnonzero(is_wall).astype(np.float64) + (first + 1.0)
+
+
+_LARGE_M, _LESS = 0.3, 1e-3
+"""Of places with the same share of steps the one with the clearer steps, up to the first, is the wall."""
+
+
+def _steps(points: FloatArray, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """How far the roof on either side of each place along a row lies off the plane of the other side, in each band
+    through it, how much of that their roughness may be, (r - 1, b) m each, and whether both are known.
+
+    ``points`` (m, 3) in columns and m, in r rows and b bands.
+    """
+    n_rows, n_bands = shape
+    row, band = np.floor(points[:, 0]).astype(np.int64), (points[:, 1] // _BAND).astype(np.int64)
+    is_in = (row >= 0) & (row < n_rows) & (band >= 0) & (band < n_bands)
+    x, y, z = points[is_in].T
+    z = z - np.median(z) if len(z) else z
+    cell = row[is_in] * n_bands + band[is_in]
+    moments = (np.ones(len(x)), x, y, z, x * x, x * y, y * y, x * z, y * z, z * z)
+    sums = [np.bincount(cell, weights=moment, minlength=n_rows * n_bands) for moment in moments]
+    total = np.zeros((n_rows + 1, n_bands, len(moments)))
+    np.cumsum(np.stack(sums, axis=-1).reshape(n_rows, n_bands, -1), axis=0, out=total[1:])
+    far, near, begin, close, end = (
+        total[np.clip(np.arange(1, n_rows) + by, 0, n_rows)] for by in (-1 - _SIDE, -1 - _CLOSE, -1, 1, 1 + _CLOSE)
+    )
+    beyond = total[np.clip(np.arange(1, n_rows) + 1 + _SIDE, 0, n_rows)]
+    left, right = _planes(begin - far), _planes(beyond - close)
+    step = np.minimum(_off(left.plane, end - close), _off(right.plane, begin - near))
+    is_known = left.is_known & right.is_known
+    return np.where(is_known, step, 0.0), _ROUGH * np.maximum(left.rough, right.rough), is_known
+
+
+class _Planes(NamedTuple):
+    """Planes (..., 3), whether enough points show them, and how far these are off them (rms, m), (...) each."""
+
+    plane: FloatArray
+    is_known: BoolArray
+    rough: FloatArray
+
+
+def _planes(sums: FloatArray) -> _Planes:
+    """The planes of points with the ``sums`` (..., 10) of 1, x, y, z, xx, xy, yy, xz, yz, zz."""
+    n = sums[..., 0]
+    is_known = n >= _LEAST
+    normal = sums[..., [[0, 1, 2], [1, 4, 5], [2, 5, 6]]] + 1e-6 * np.eye(3)
+    normal[~is_known] = np.eye(3)
+    right = sums[..., [3, 7, 8]]
+    plane = np.linalg.solve(normal, right[..., None])[..., 0]
+    off = np.maximum(sums[..., 9] - np.sum(plane * right, axis=-1), 0.0)
+    return _Planes(plane, is_known, np.sqrt(off / np.maximum(n - 3.0, 1.0)))
+
+
+def _off(plane: FloatArray, sums: FloatArray) -> FloatArray:
+    """How far (...) m points with these ``sums`` (..., 10) lie off a ``plane`` (..., 3) in the mean, 0 for none."""
+    off = sums[..., 3] - np.sum(plane * sums[..., :3], axis=-1)
+    return np.asarray(np.abs(off) / np.maximum(sums[..., 0], 1.0))

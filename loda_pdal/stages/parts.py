@@ -128,9 +128,9 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, 
         plants += connected_regions(cells, own.swapped, bare.before, is_plant, *plant)
         regions += [region for region in plants if region.share_new > 0.5]  # not a crown that rose
     is_of_bodies = params.fills_buildings and bool(has_houses.any())
-    top = _tops(surfaces, columns_of[0], params.voxel_m) if is_of_bodies else None
+    roofs = surfaces.map(lambda side: _roof(side, columns_of[0], params.voxel_m)) if is_of_bodies else None
     columns, part, parent, is_house, is_extension = _claim(
-        regions, columns_of, has_houses & is_pair, is_long, is_plant, top, params
+        regions, columns_of, has_houses & is_pair, is_long, is_plant, roofs, params
     )
     if len(parent) == 0:
         return Parts(owner, nobody, nothing, nothing)
@@ -187,19 +187,16 @@ def _columns_of(cells: Cells, n: int) -> tuple[Int64Array, Int64Array]:
     return rows, np.searchsorted(rows[:, 0], np.arange(n + 1))
 
 
-def _tops(surfaces: Pair[Surface], columns: Int64Array, cell_m: float) -> FloatArray:
-    """Highest point (k,) m of each of the sorted ``columns`` (k, 3), that of the lower epoch where both have some."""
+def _roof(surface: Surface, columns: Int64Array, cell_m: float) -> FloatArray:
+    """Highest point (k, 3) m that was measured in each of the sorted ``columns`` (k, 3), NaN where none was."""
     lattice = Lattice.around(columns)
-    keys = lattice.keys(columns)
-    tops = []
-    for surface in surfaces:
-        own = np.flatnonzero(surface.owner >= 0)
-        cell = np.column_stack([surface.owner[own].astype(np.int64), cells_of(surface.xyz[own, :2], cell_m)])
-        found = lattice.find(keys, cell)
-        top = np.full(len(keys), -np.inf)
-        np.maximum.at(top, found[found >= 0], surface.xyz[own[found >= 0], 2])
-        tops.append(np.where(np.isfinite(top), top, np.inf))
-    return np.asarray(np.minimum(*tops))
+    own = np.flatnonzero((surface.owner >= 0) & (surface.n_raw > 0))
+    own = own[np.lexsort(surface.xyz[own].T)]
+    cell = np.column_stack([surface.owner[own].astype(np.int64), cells_of(surface.xyz[own, :2], cell_m)])
+    found = lattice.find(lattice.keys(columns), cell)
+    highest = np.full((len(columns), 3), np.nan)
+    highest[found[found >= 0]] = surface.xyz[own[found >= 0]]
+    return highest
 
 
 def _are_in_rows(columns: Int64Array, n: int) -> BoolArray:
@@ -329,11 +326,11 @@ def _claim(
     has_houses: BoolArray,
     is_long: BoolArray,
     is_plant: BoolArray,
-    top: FloatArray | None,
+    roofs: Pair[FloatArray] | None,
     params: ChangeParams,
 ) -> tuple[Int64Array, Int64Array, IntArray, BoolArray, BoolArray]:
     """Columns (k, 3) that parts take, the part of each, and for each part its parent, whether it is a house, and
-    whether it is built onto one. ``top`` (k,) m of the columns, where buildings are bodies.
+    whether it is built onto one. ``roofs`` (k, 3) m: the highest point of each column, where buildings are bodies.
 
     The largest region comes first. The parent of a part in a house that is a part itself, number p, is ``-1 - p``.
     """
@@ -348,7 +345,7 @@ def _claim(
         is_in_row = has_houses[region.parent] and is_long[region.parent]
         is_new = bool(has_houses[region.parent]) and region.share_new > 0.5
         is_new = is_new and region.n_voxels * params.voxel_m**3 > params.part_is_new_m3
-        is_wide = top is None and _least_side(region.columns) * params.voxel_m > _WIDE * params.frontage_m
+        is_wide = roofs is None and _least_side(region.columns) * params.voxel_m > _WIDE * params.frontage_m
         is_new = is_new and (is_in_row or is_wide)
         most_of = 1.0 if is_new or is_plant[region.parent] else _MOST_OF_ROW if is_in_row else _MOST_OF
         if np.count_nonzero(is_inside) > most_of * (last - first):
@@ -358,20 +355,24 @@ def _claim(
             width_m = float((np.ptp(region.columns, axis=0) + 1).max()) * params.voxel_m
             is_storey = region.share_new < 0.5 and width_m > _WIDE * params.frontage_m
             is_onto = bool(has_houses[region.parent]) and width_m > _LEAST_ANNEX_M and not is_new and not is_storey
-            is_extension.append(is_onto and top is None)  # of a body it is known once its house is found
+            is_extension.append(is_onto and roofs is None)  # of a body it is known once its house is found
             is_tall = region.n_voxels * params.voxel_m > _TALL * len(region.columns) * width_m
-            if is_onto and (is_in_row if top is None else region.share_new > 0.5 and not is_tall):
+            if is_onto and (is_in_row if roofs is None else region.share_new > 0.5 and not is_tall):
                 in_rows.append((len(parents), region))
             part_of[first:last][is_free] = len(parents)
             parents.append(region.parent)
     is_house = [False] * len(parents)
     for part, region in in_rows:
-        if top is None:
+        if roofs is None:
             free = np.arange(start[region.parent], start[region.parent + 1])
             free = free[house_about(region.columns, rows[free, 1:], params) & (part_of[free] < 0)]
         else:
             free = np.flatnonzero((part_of < 0) & has_houses[rows[:, 0]])
-            free = free[house_behind(region.columns, region.top_m, rows[free, 1:], top[free], params)]
+            free = free[
+                house_behind(
+                    region.columns, region.top_m, rows[free, 1:], Pair(roofs.before[free], roofs.after[free]), params
+                )
+            ]
         if len(free):
             is_extension[part] = True
             parents[part] = -1 - len(parents)

@@ -262,8 +262,8 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
     has_volume = params.use_volume and abs(cue.dv_ratio) > ratio
     if params.fills_buildings and cue.object_class == ObjectClass.BUILDING:
         # edges of roofs come and go with the sampling: a body changed where a piece of it did, or most of its roof
-        is_solid = max(cue.grown_m3, cue.cut_m3) > 0
-        has_volume &= is_solid
+        has_volume &= max(cue.grown_m3, cue.cut_m3) > 0
+        is_solid = (cue.grown_m3 if dh > 0 else cue.cut_m3) > 0  # what is lower than the house lowers no roof
         has_height &= is_solid or (is_alike and abs(cue.column_rise) > max(gate, height_m))
     # a top that moves by more than what hides a voxel leaves voxels behind
     is_hideable = not params.needs_sight or abs(cue.dh) < _HIDES_VOXEL * params.query_radius_m
