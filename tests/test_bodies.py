@@ -18,6 +18,7 @@ from loda_pdal.stages.filling import fill_columns, filled_everywhere
 from loda_pdal.stages.instances import split_at_steps
 from loda_pdal.stages.observability import coverage
 from loda_pdal.stages.parts import largest_regions, width_of
+from loda_pdal.stages.rules import Cue, verdict_of
 
 AERIAL = Parameters.preset("aerial")
 
@@ -138,6 +139,19 @@ def test_what_is_much_taller_than_long_has_no_house_behind_it() -> None:
     changes = decide([(0, row)], [(0, row), (0, tower)], ObjectClass.BUILDING)
     assert sorted(changes.label) == [ChangeLabel.UNCHANGED, ChangeLabel.INCREASED]
     assert (changes.owner.after[: len(row)] == np.argmin(changes.label)).mean() > 0.95
+
+
+@pytest.mark.parametrize(("grown_m3", "cut_m3", "label"), [(20, 0, "INCREASED"), (0, 20, "DECREASED")])
+def test_a_body_goes_the_way_of_the_piece_that_came_or_went_whichever_way_its_top_goes(
+    grown_m3: float, cut_m3: float, label: str
+) -> None:
+    for dh in (-9.0, 9.0):  # the edge of the house's roof in one epoch, the annex before it in the other
+        figures = dict.fromkeys(Cue._fields, 0.0) | {"dh": dh, "iou": 0.8, "observability": 1.0, "lod95": 0.05}
+        figures |= {"gained_above": 9.0, "lost_above": 9.0, "column_scatter": 9.0, "n_voxels": 100.0}
+        figures |= {"grown_m3": grown_m3, "cut_m3": cut_m3, "support_before": 0.9, "support_after": 0.9}
+        cue = Cue(**figures)._replace(object_class=ObjectClass.BUILDING, is_before=True, is_after=True)  # type: ignore[arg-type]
+        verdict = verdict_of(cue, False, False, AERIAL.changes.for_bodies(), ObservabilityParams())
+        assert verdict.label.name == label
 
 
 def test_an_edge_that_was_sampled_once_is_no_change() -> None:

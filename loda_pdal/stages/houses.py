@@ -16,16 +16,16 @@ from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams
 
 _STEP_M = 0.03
-"""Roofs whose planes meet with a step of this much, all through a row, are two; one place says nothing."""
+"""Roofs that lie this much off each other's planes, all through a row, are two; one place says nothing."""
 
 _ROUGH = 1.5
-"""A step is this many times what the roofs beside it are off their planes: a ridge or a dormer is none."""
+"""A step is more than this many times what the roofs beside it are off their planes: a ridge or a dormer is none."""
 
 _SIDE = 5
 """Columns along the row, from the one beside the wall on, that show the plane of a roof."""
 
 _CLOSE = 2
-"""Columns next to the wall whose roof is off the plane of the other side."""
+"""Columns next to the wall that lie off the plane of the other side: farther in a slope may end."""
 
 _BAND = 3
 """Columns through the row that are looked at together."""
@@ -260,7 +260,7 @@ def _planes(sums: FloatArray) -> _Planes:
     normal = sums[..., [[0, 1, 2], [1, 4, 5], [2, 5, 6]]] + 1e-6 * np.eye(3)
     normal[~is_known] = np.eye(3)
     right = sums[..., [3, 7, 8]]
-    plane = np.linalg.solve(normal, right[..., None])[..., 0]
+    plane: FloatArray = np.linalg.solve(normal, right[..., None])[..., 0].astype(np.float64)
     off = np.maximum(sums[..., 9] - np.sum(plane * right, axis=-1), 0.0)
     return _Planes(plane, is_known, np.sqrt(off / np.maximum(n - 3.0, 1.0)))
 
