@@ -31,7 +31,7 @@ from loda_pdal.model.registration import Registration
 from loda_pdal.model.survey import Survey
 from loda_pdal.model.transform import transform_points
 from loda_pdal.params import ChangeParams, Parameters
-from loda_pdal.preset_choice import doubts_about
+from loda_pdal.preset_choice import doubts_about, preset_for
 from loda_pdal.stages.association import Descriptors, Matches, associate, describe
 from loda_pdal.stages.changes import Changes, decide_changes
 from loda_pdal.stages.correspondence import Objects, match_instances
@@ -83,7 +83,7 @@ def detect_changes(
     before, after : Survey
         Both epochs in one local frame, see `read_epochs`.
     parameters : Parameters, optional
-        Choices of the method; the ``street`` preset if left out.
+        Choices of the method; the preset that suits the surveys (`preset_for`) if left out.
     progress : callable, optional
         ``progress(done, total, text)``, called before each step and at the end.
 
@@ -93,7 +93,7 @@ def detect_changes(
         Objects, changed ground, and values for every raw point, in local metres of the after frame.
     """
     surveys = Pair(before, after)
-    p = resolve(parameters or Parameters(), surveys)
+    p = resolve(parameters or Parameters.preset(preset_for(surveys).name), surveys)
     clock = StepClock(progress)
     with clock("fuse"):
         fused = fuse_epochs(surveys, p)
