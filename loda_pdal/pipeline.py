@@ -35,6 +35,7 @@ from loda_pdal.preset_choice import doubts_about, preset_for
 from loda_pdal.stages.association import Descriptors, Matches, associate, describe
 from loda_pdal.stages.changes import Changes, decide_changes
 from loda_pdal.stages.correspondence import Objects, match_instances
+from loda_pdal.stages.crowns import Crowns, find_crowns
 from loda_pdal.stages.cues import Surface
 from loda_pdal.stages.features import Features, eigen_features
 from loda_pdal.stages.filling import bodies, filled, filled_everywhere
@@ -230,12 +231,15 @@ def classify_superpoints(clouds: Pair[VoxelCloud], segments: Pair[Segments], p: 
 def segment_instances(
     clouds: Pair[VoxelCloud], ground: Pair[Ground], classes: Pair[Semantics], p: Parameters
 ) -> Pair[Instances]:
-    """Instances within each class (section 4.2)."""
+    """Instances within each class (section 4.2); touching crowns part in both where one epoch shows it."""
+    is_plant = classes.map(lambda side: side.classification == ObjectClass.VEGETATION)
+    plants = clouds.join(is_plant, lambda cloud, asked: cloud.xyz[asked])
+    crowns = find_crowns(plants, ground.join(is_plant, lambda g, asked: g.height[asked]))
 
-    def of_epoch(cloud: VoxelCloud, g: Ground, semantics: Semantics) -> Instances:
-        return form_instances(cloud.xyz, cloud.n_raw, g.height, semantics, p.instances, p.semantics)
+    def of_epoch(cloud: VoxelCloud, g: Ground, semantics: Semantics, own: Crowns) -> Instances:
+        return form_instances(cloud.xyz, cloud.n_raw, g.height, semantics, own, p.instances, p.semantics)
 
-    return at_once(of_epoch, clouds, ground, classes)
+    return at_once(of_epoch, clouds, ground, classes, crowns)
 
 
 def match_objects(
