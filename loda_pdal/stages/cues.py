@@ -347,6 +347,9 @@ def sample_voxels(
         if params.needs_returns:
             covered = covered.join(over, np.logical_and)
         is_open = coverage.swapped.join(xyz, lambda other, points: other.at(points))
+        if params.needs_sight:
+            shaded = _in_shadow(cell, columns, surfaces, params.voxel_m)
+            covered = covered.join(shaded, lambda seen, dark: seen & ~dark)
     return Voxels(
         cell=cell,
         centre=centre,
@@ -412,6 +415,44 @@ def _is_over(
         column = lattice.find(keys, place + (np.array(step) - reach))
         lowest = np.fmin(lowest, Groups(column, len(first)).minimum(xyz[:, 2]))
     return np.asarray(np.repeat(lowest, np.diff(columns)) < centre[:, 2])
+
+
+def _in_shadow(
+    cell: Int64Array, columns: Int64Array, surfaces: Pair[Surface], voxel_m: float
+) -> Pair[BoolArray]:
+    """Whether each voxel (c,) stands where that epoch shows hardly any of the ground that the other epoch shows.
+
+    What came or went takes ground out of sight, or lets it be seen; where there is less of it without the thing than
+    with it, something nearer to the sensor hid both.
+    """
+    first = columns[:-1]
+    if len(first) == 0:
+        return Pair(np.zeros(len(cell), np.bool_), np.zeros(len(cell), np.bool_))
+    plan = cell[first, :2]
+
+    def ground_about(surface: Surface) -> IntArray:
+        place = cells_of(surface.xyz[~surface.is_surface, :2], voxel_m)
+        lattice = Lattice.around(np.concatenate([plan, place]))
+        keys, counts = np.unique(lattice.keys(place), return_counts=True)
+        counts = np.append(counts, 0)
+        steps = np.ndindex(2 * _GROUND_REACH + 1, 2 * _GROUND_REACH + 1)
+        return np.sum([counts[lattice.find(keys, plan + (np.array(s) - _GROUND_REACH))] for s in steps], axis=0)
+
+    shown = surfaces.map(ground_about)
+    dark = shown.join(
+        shown.swapped, lambda own, other: (other >= _LEAST_GROUND) & (own <= _HARDLY_ANY * other)
+    )
+    return dark.map(lambda side: np.repeat(side, np.diff(columns)))
+
+
+_GROUND_REACH = 2
+"""Columns on either side of a voxel's in which ground tells whether the place was seen."""
+
+_LEAST_GROUND = 12
+"""Points of ground there, fused, before an epoch that has hardly any must have been kept from seeing it."""
+
+_HARDLY_ANY = 0.1
+"""Share of the other epoch's ground: shadows are dark."""
 
 
 def _is_clear(cell: Int64Array, columns: Int64Array, surface: Surface, voxel_m: float) -> BoolArray:

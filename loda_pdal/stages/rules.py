@@ -198,7 +198,8 @@ def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: Ob
             f"the {other} survey could have seen only {cue.observability:.0%} of it "
             f"(at least {observability.min_observability:.0%} needed){_hidden(cue)}",
         )
-    if is_apart:
+    is_undone = cue.object_class in (ObjectClass.BUILDING, ObjectClass.VEGETATION)
+    if is_apart and not (is_undone and support >= params.min_support):
         return Verdict(
             label, f"what the {other} survey shows there is another object; it shares {support:.0%} of the surface"
         )
