@@ -748,14 +748,18 @@ def _summit(owner: IntArray, top: FloatArray, n: int) -> FloatArray:
 
 def _rise_of_columns(rises: tuple[IntArray, FloatArray], n: int, least: int) -> tuple[FloatArray, FloatArray]:
     """Median change of the columns' tops (n,) m over the columns that both epochs have, and the distance (n,) m of the
-    quartiles; NaN with fewer than ``least`` columns."""
+    quartiles, wider where the median of few columns is less sure; NaN with fewer than ``least`` columns."""
     groups = Groups(rises[0], n)
     is_told = groups.counts >= least
     scatter = groups.quantile(rises[1], 0.75) - groups.quantile(rises[1], 0.25)
+    scatter *= np.sqrt(np.fmax(_SURE_COLUMNS / np.maximum(groups.counts, 1), 1.0))
     return np.where(is_told, groups.median(rises[1]), np.nan), np.where(is_told, scatter, np.nan)
 
 
 _LEAST_COLUMNS = 8
+
+_SURE_COLUMNS = 25
+"""Columns whose median is as sure as one asks for: the error of a median goes with the root of their number."""
 
 
 def _fair_rises(voxels: Voxels, surfaces: Pair[Surface], n: int) -> tuple[IntArray, FloatArray]:

@@ -109,17 +109,18 @@ def verdict_of(
     if not (cue.is_before and cue.is_after):
         alone = _unmatched(cue, is_apart, params, observability)
         return extension(alone) if is_part and _is_piece(cue, params) else alone
-    if observability.is_enabled and cue.observability < observability.min_observability:
+    if cue.object_class == ObjectClass.MOBILE:
+        found = _mobile(cue, params)
+    else:
+        found = (_new_part(cue, params) if is_part else None) or _pair(cue, params)
+    is_same = found.label == ChangeLabel.UNCHANGED and max(cue.support_before, cue.support_after) >= params.min_support
+    if observability.is_enabled and cue.observability < observability.min_observability and not is_same:
         return Verdict(
             ChangeLabel.UNDETERMINED,
             f"both surveys saw only {cue.observability:.0%} of it "
             f"(at least {observability.min_observability:.0%} needed){_hidden(cue)}",
         )
-    if cue.object_class == ObjectClass.MOBILE:
-        return _mobile(cue, params)
-    if is_part and (new := _new_part(cue, params)):
-        return new
-    return _pair(cue, params)
+    return found
 
 
 def _new_part(cue: Cue, params: ChangeParams) -> Verdict | None:
