@@ -151,13 +151,13 @@ def extension(verdict: Verdict) -> Verdict:
     return verdict if label is None else Verdict(label, f"a piece of the building: {verdict.reason}")
 
 
-def screen(verdict: Verdict) -> Verdict:
-    """What stands before a house and hides nothing of it is a thing of its own, and the house has not grown."""
+def of_its_own(verdict: Verdict, why: str) -> Verdict:
+    """What stands before a house and is not built onto it came or went itself, and the house has not grown."""
     own = {ChangeLabel.INCREASED: ChangeLabel.ADDED, ChangeLabel.DECREASED: ChangeLabel.REMOVED}
     label = own.get(verdict.label, verdict.label)
     if label not in own.values():
         return verdict
-    return Verdict(label, f"the wall behind it shows as before: {verdict.reason}")
+    return Verdict(label, f"{why}: {verdict.reason}")
 
 
 def uncovered(verdict: Verdict) -> Verdict:
