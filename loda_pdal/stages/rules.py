@@ -261,7 +261,11 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
     if params.fills_buildings and cue.object_class == ObjectClass.BUILDING and abs(cue.column_rise) > abs(dh):
         dh = cue.column_rise  # most of the roof moved, if not its highest part
     has_height = params.use_height and abs(dh) > max(gate, height_m)  # NaN is never above
-    has_volume = params.use_volume and abs(cue.dv_ratio) > ratio
+    dv_ratio = cue.dv_ratio
+    if params.needs_sight and is_green and cue.tall >= LOW_M:  # a crown is as large as the survey says that shows more
+        large = max(cue.volume_before, cue.volume_after)
+        dv_ratio = (cue.gained - cue.lost) * params.voxel_m**3 / large if large > 0 else math.nan
+    has_volume = params.use_volume and abs(dv_ratio) > ratio
     if params.fills_buildings and cue.object_class == ObjectClass.BUILDING:
         # edges of roofs come and go with the sampling: a body changed where a piece of it did, or most of its roof
         is_solid = max(cue.grown_m3, cue.cut_m3) > 0
@@ -285,8 +289,8 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
         rises, sinks = rises or rose, sinks or fell
     noise = params.volume_sigmas * math.sqrt(cue.gained + cue.lost)
     has_volume = has_volume and abs(cue.gained - cue.lost) >= noise
-    swells = has_volume and cue.dv_ratio > 0 and (least == 0 or cue.gained >= max(least, cue.lost))
-    shrinks = has_volume and cue.dv_ratio < 0 and (least == 0 or cue.lost >= max(least, cue.gained))
+    swells = has_volume and dv_ratio > 0 and (least == 0 or cue.gained >= max(least, cue.lost))
+    shrinks = has_volume and dv_ratio < 0 and (least == 0 or cue.lost >= max(least, cue.gained))
     figures = _figures(cue, dh, height_m, ratio, gate)
     if by_columns:
         figures = f"columns {cue.column_rise:+.2f} m in the median (limit {least_rise:.2f} m), {figures}"
