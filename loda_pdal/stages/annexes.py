@@ -150,9 +150,7 @@ def came_into_sight(cells: Cells, is_grown: Pair[BoolArray], is_gone: Pair[BoolA
     return found
 
 
-def slopes_from_walls(
-    cells: Cells, surfaces: Pair[Surface], parent: IntArray, is_asked: BoolArray
-) -> FloatArray:
+def slopes_from_walls(cells: Cells, surfaces: Pair[Surface], parent: IntArray, is_asked: BoolArray) -> FloatArray:
     """How steeply the tops of the parts asked for (n,) rise away from the wall of the house that they stand against,
     m per m; NaN where it cannot be told.
 

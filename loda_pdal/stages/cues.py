@@ -256,7 +256,7 @@ class Evidence:
         Raw points in the gained or lost voxels, of the epoch that has more of them.
     column_rise, column_scatter : m
         Median change of the top over the columns that both epochs occupy, and what lies between the quartiles of these
-        changes; NaN with fewer than eight of them.
+        changes, more where the columns are few; NaN with fewer than eight of them.
     iou, shift : 3D overlap of the occupancy, and distance of the centroids (m).
     dh : m
         Change of the height that the parameters name.
@@ -417,9 +417,7 @@ def _is_over(
     return np.asarray(np.repeat(lowest, np.diff(columns)) < centre[:, 2])
 
 
-def _in_shadow(
-    cell: Int64Array, columns: Int64Array, surfaces: Pair[Surface], voxel_m: float
-) -> Pair[BoolArray]:
+def _in_shadow(cell: Int64Array, columns: Int64Array, surfaces: Pair[Surface], voxel_m: float) -> Pair[BoolArray]:
     """Whether each voxel (c,) stands where that epoch shows hardly any of the ground that the other epoch shows.
 
     What came or went takes ground out of sight, or lets it be seen; where there is less of it without the thing than
@@ -436,12 +434,11 @@ def _in_shadow(
         keys, counts = np.unique(lattice.keys(place), return_counts=True)
         counts = np.append(counts, 0)
         steps = np.ndindex(2 * _GROUND_REACH + 1, 2 * _GROUND_REACH + 1)
-        return np.sum([counts[lattice.find(keys, plan + (np.array(s) - _GROUND_REACH))] for s in steps], axis=0)
+        about = [counts[lattice.find(keys, plan + (np.array(step) - _GROUND_REACH))] for step in steps]
+        return np.asarray(np.sum(about, axis=0), dtype=np.int32)
 
     shown = surfaces.map(ground_about)
-    dark = shown.join(
-        shown.swapped, lambda own, other: (other >= _LEAST_GROUND) & (own <= _HARDLY_ANY * other)
-    )
+    dark = shown.join(shown.swapped, lambda own, other: (other >= _LEAST_GROUND) & (own <= _HARDLY_ANY * other))
     return dark.map(lambda side: np.repeat(side, np.diff(columns)))
 
 
