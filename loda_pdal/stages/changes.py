@@ -130,16 +130,12 @@ def decide_changes(
     ]
     has_walls = not params.fills_buildings
     is_building = cast.object_class == ObjectClass.BUILDING
-    is_screen = screens(cells, is_building, cast.is_extension & has_walls)
-    is_shed = slopes_from_walls(cells, cast.surfaces, cast.parent, cast.is_extension & has_walls) > _FALLS
+    is_asked = cast.is_extension & has_walls
+    is_shed = slopes_from_walls(cells, cast.surfaces, cast.parent, is_asked) > _FALLS
+    is_screen = is_shed | screens(cells, is_building, is_asked)
     for i in np.flatnonzero(cast.is_extension).tolist():
-        verdicts[i] = (
-            of_its_own(verdicts[i], "its roof falls towards the wall behind it")
-            if is_shed[i]
-            else of_its_own(verdicts[i], "the wall behind it shows as before")
-            if is_screen[i]
-            else extension(verdicts[i])
-        )
+        why = "its roof falls towards the wall behind it" if is_shed[i] else "the wall behind it shows as before"
+        verdicts[i] = of_its_own(verdicts[i], why) if is_screen[i] else extension(verdicts[i])
     if params.needs_sight:
         verdicts = _without_uncovered(verdicts, cells, is_building, evidence.n_voxels)
     raw = np.array(
@@ -148,7 +144,7 @@ def decide_changes(
             for cue, v, apart in zip(cues, verdicts, cast.is_apart.tolist(), strict=True)
         ]
     )
-    is_of_house = np.append(cast.is_house, False)[cast.parent] & cast.is_extension & ~(is_screen | is_shed)
+    is_of_house = np.append(cast.is_house, False)[cast.parent] & cast.is_extension & ~is_screen
     is_built_on = are_built_on(cells, cast.surfaces, cast.parent, is_of_house, has_walls=has_walls)
     for i, part in changed_houses(verdicts, cast.parent, is_built_on, evidence.dv).items():
         verdicts[i] = Verdict(verdicts[part].label, f"a part of it changed: {verdicts[part].reason}")
