@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -296,6 +296,75 @@ def test_of_two_houses_that_touch_one_is_removed_and_the_other_stays() -> None:
     gone = labels(found).index(ChangeLabel.REMOVED)
     assert before.xyz[found.owner.before == gone, 0].min() > 5.0
     assert [label.swapped for label in labels(found)] == labels(decide(after, before, ObjectClass.BUILDING))
+
+
+def pent_shed(x: float, y: float, fall: float) -> tuple[FloatArray, FloatArray]:
+    """What a survey shows of a shed against a wall at ``y``: front and sides, under a roof that falls to the wall."""
+    points, normals = block(x, y - 2, 2.5, 2.0, 3.0)
+    depth = y - points[:, 1]
+    is_shown = (depth > 0) & (points[:, 2] <= 2.3 + fall * depth) & (normals[:, 2] == 0)
+    return points[is_shown], normals[is_shown]
+
+
+@pytest.mark.parametrize(
+    ("fall", "house", "part"),
+    [
+        (0.0, ChangeLabel.INCREASED, ChangeLabel.INCREASED),
+        (0.25, ChangeLabel.UNCHANGED, ChangeLabel.ADDED),
+        (-0.25, ChangeLabel.INCREASED, ChangeLabel.INCREASED),
+    ],
+    ids=["level", "towards the wall", "away from it"],
+)
+def test_a_roof_that_falls_towards_the_wall_is_no_annex(fall: float, house: ChangeLabel, part: ChangeLabel) -> None:
+    x, y, z = HOUSE[0].T
+    is_hidden = (x > 2) & (x < 4.5) & (y == 0) & (z < 2.3)
+    hidden = HOUSE[0][~is_hidden], HOUSE[1][~is_hidden]
+    before, after = surface((0, HOUSE)), surface((0, joined(hidden, pent_shed(2, 0, fall))))
+    found = decide(before, after, ObjectClass.BUILDING)
+    of_house = int(found.owner.before[np.flatnonzero(y > 2)[0]])
+    assert labels(found)[of_house] == house
+    assert [label for i, label in enumerate(labels(found)) if i != of_house] == [part]
+    assert [label.swapped for label in labels(found)] == labels(decide(after, before, ObjectClass.BUILDING))
+
+
+def test_a_sliver_of_a_wall_is_no_part_of_a_house() -> None:
+    """A stack of voxels up a side wall that one survey met and the other did not."""
+    sliver = block(10.3, 1.0, 0.25, 0.5, 5.5)
+    found = decide(surface((0, joined(HOUSE, sliver))), surface((0, HOUSE)), ObjectClass.BUILDING)
+    assert labels(found) == [ChangeLabel.UNCHANGED]
+
+
+def test_a_shed_that_was_paired_with_the_house_beside_it_stays_when_the_house_goes() -> None:
+    house, shed = block(0, 0, 12, 9, 8), block(12.5, 0, 2.5, 2, 2.5)
+    found = decide(surface((0, joined(house, shed))), surface((0, shed)), ObjectClass.BUILDING)
+    assert set(labels(found)) == {ChangeLabel.UNCHANGED, ChangeLabel.REMOVED}
+    assert all(labels(found)[i] == ChangeLabel.UNCHANGED for i in set(found.owner.after[: len(shed[0])].tolist()))
+
+
+def without_ground(side: Surface, low: float, high: float) -> Surface:
+    """The same survey, which shows no ground between ``low`` and ``high`` along x."""
+    is_kept = (side.owner >= 0) | (side.xyz[:, 0] < low) | (side.xyz[:, 0] > high)
+    return Surface(*(getattr(side, item.name)[is_kept] for item in fields(side)))
+
+
+def test_what_stands_in_the_shadow_of_something_has_neither_come_nor_gone() -> None:
+    """A car that one survey shows, where the other shows nothing of the ground beside it: a lorry stood before both."""
+    car = block(10, 0, 4.5, 1.8, 1.5)
+    there, bare = surface((0, car)), surface()
+    assert labels(decide(there, bare, ObjectClass.MOBILE)) == [ChangeLabel.REMOVED]
+    found = decide(there, without_ground(bare, 5, 20), ObjectClass.MOBILE)
+    assert labels(found) == [ChangeLabel.UNDETERMINED]
+    assert labels(decide(without_ground(bare, 5, 20), there, ObjectClass.MOBILE)) == [ChangeLabel.UNDETERMINED]
+
+
+def test_what_both_surveys_show_of_a_thing_is_unchanged_however_little_of_the_rest_one_saw() -> None:
+    row = block(0, 0, 45, 8, 6)
+    is_near = row[0][:, 0] < 6
+    near = coverage(GROUND[GROUND[:, 0] < 5], ObservabilityParams())
+    before, after = surface((0, (row[0][is_near], row[1][is_near]))), surface((0, row))
+    found = decide(before, after, ObjectClass.BUILDING, seen=Pair(near, everywhere()))
+    assert found.evidence.observability[0] < STREET.observability.min_observability
+    assert labels(found) == [ChangeLabel.UNCHANGED]
 
 
 def test_a_porch_on_a_row_changes_one_frontage_of_it() -> None:

@@ -16,7 +16,7 @@ from loda_pdal.model.labels import ChangeLabel, ObjectClass
 from loda_pdal.model.lod_grid import LodGrid
 from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams, ConfidenceParams, ObservabilityParams
-from loda_pdal.stages.annexes import are_built_on, came_into_sight, screens
+from loda_pdal.stages.annexes import are_built_on, came_into_sight, screens, slopes_from_walls
 from loda_pdal.stages.cast import FOLIAGE_M, Cast
 from loda_pdal.stages.confidence import calibrated
 from loda_pdal.stages.correspondence import rank_by_place
@@ -33,8 +33,8 @@ from loda_pdal.stages.rules import (
     extension,
     is_no_pair,
     is_within,
+    of_its_own,
     raw_score,
-    screen,
     uncovered,
     verdict_of,
 )
@@ -130,9 +130,12 @@ def decide_changes(
     ]
     has_walls = not params.fills_buildings
     is_building = cast.object_class == ObjectClass.BUILDING
-    is_screen = screens(cells, is_building, cast.is_extension & has_walls)
+    is_asked = cast.is_extension & has_walls
+    is_shed = slopes_from_walls(cells, cast.surfaces, cast.parent, is_asked) > _FALLS
+    is_screen = is_shed | screens(cells, is_building, is_asked)
     for i in np.flatnonzero(cast.is_extension).tolist():
-        verdicts[i] = screen(verdicts[i]) if is_screen[i] else extension(verdicts[i])
+        why = "its roof falls towards the wall behind it" if is_shed[i] else "the wall behind it shows as before"
+        verdicts[i] = of_its_own(verdicts[i], why) if is_screen[i] else extension(verdicts[i])
     if params.needs_sight:
         verdicts = _without_uncovered(verdicts, cells, is_building, evidence.n_voxels)
     raw = np.array(
@@ -250,6 +253,9 @@ def _stands_aside(cast: Cast, cues: list[Cue], is_asked: BoolArray, params: Chan
     is_off = aside > limit
     return is_off & (roughness(cast.surfaces, is_off) < FOLIAGE_M)
 
+
+_FALLS = 0.1
+"""Slope of a roof, m per m, that is meant: what is level as built is measured within less."""
 
 _LINE_M = 1.5
 """Hedges, fences and walls are narrower, and vehicles, sheds and skips are wider."""

@@ -354,8 +354,10 @@ def _claim(
         if np.count_nonzero(is_inside) > most_of * (last - first):
             continue
         is_free = is_inside & (part_of[first:last] < 0)
+        width_m = float((np.ptp(region.columns, axis=0) + 1).max()) * params.voxel_m
+        if has_houses[region.parent] and top is None and width_m <= _LEAST_ANNEX_M:
+            continue
         if is_free.any():
-            width_m = float((np.ptp(region.columns, axis=0) + 1).max()) * params.voxel_m
             is_storey = region.share_new < 0.5 and width_m > _WIDE * params.frontage_m
             is_onto = bool(has_houses[region.parent]) and width_m > _LEAST_ANNEX_M and not is_new and not is_storey
             is_extension.append(is_onto and top is None)  # of a body it is known once its house is found
