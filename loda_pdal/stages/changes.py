@@ -122,7 +122,8 @@ def decide_changes(
     cast = _divided(surfaces, object_class, voxels, params)
     cells = cast.cells(voxels, params)
     evidence = weigh(cells, cast.surfaces, len(cast), params)
-    cues = cues_of(evidence, cast.object_class, largest_regions(cells, len(cast), params))
+    regions = largest_regions(cells, len(cast), params)
+    cues = cues_of(evidence, cast.object_class, regions)
     is_part = (cast.parent >= 0) & ~cast.is_extension
     verdicts = [
         verdict_of(cue, apart, part, params, observability)
@@ -142,7 +143,8 @@ def decide_changes(
         ]
     )
     is_of_house = np.append(cast.is_house, False)[cast.parent] & cast.is_extension & ~is_screen
-    is_built_on = are_built_on(cells, cast.surfaces, cast.parent, is_of_house, has_walls=has_walls)
+    is_on_top = (np.fmax(*regions) > 0) & has_walls
+    is_built_on = are_built_on(cells, cast.surfaces, cast.parent, is_of_house, is_on_top, has_walls=has_walls)
     for i, part in changed_houses(verdicts, cast.parent, is_built_on, evidence.dv).items():
         verdicts[i] = Verdict(verdicts[part].label, f"a part of it changed: {verdicts[part].reason}")
         raw[i] = raw[part]
