@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import numpy as np
 
+from loda_pdal.kernels.clusters import linked
 from loda_pdal.kernels.neighbours import nearest
 from loda_pdal.model.boxes import upright_boxes
 from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array, IntArray
 from loda_pdal.model.grid import Lattice, cells_of
-from loda_pdal.model.groups import Groups
+from loda_pdal.model.groups import Groups, consecutive
 from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams
 from loda_pdal.stages.cast import FOLIAGE_M
 from loda_pdal.stages.cues import Cells, Surface, Voxels
 from loda_pdal.stages.parts import Region, connected_regions
+from loda_pdal.stages.rules import LOW_M
 from loda_pdal.stages.vehicles import roughness
 
 _LEAST_NEW = 0.7
@@ -103,6 +105,74 @@ def _given(surface: Surface, things: list[Region], first: int, voxel_m: float) -
     keys, number = keys[order][is_first], number[order][is_first]
     found = lattice.find(keys, np.column_stack([surface.owner.astype(np.int64), cells_of(surface.xyz[:, :2], voxel_m)]))
     return np.where(found >= 0, number[np.maximum(found, 0)], surface.owner).astype(np.int32)
+
+
+def split_close_things(
+    surfaces: Pair[Surface], is_asked: BoolArray, params: ChangeParams
+) -> tuple[Pair[IntArray], IntArray]:
+    """Small things that stand nearer to what they are merged with than the occupancy tells apart.
+
+    A bicycle against a bench, a bollard by a hedge: the bench is within reach of all of the bicycle. But nothing stands
+    where its points are, to the width of a fused point, and the ground that it stands on shows in the other survey.
+
+    Parameters
+    ----------
+    surfaces : Pair of Surface
+        Points with their objects, 0 to ``n - 1``.
+    is_asked : (n,) bool
+        Objects that are looked through.
+
+    Returns
+    -------
+    owner, host
+        As of `split_things`.
+    """
+    n = len(is_asked)
+    before, host_before = _close_things(surfaces, is_asked, n, params)
+    after, host_after = _close_things(surfaces.swapped, is_asked, n + len(host_before), params)
+    return Pair(before, after), np.concatenate([host_before, host_after])
+
+
+def _close_things(
+    surfaces: Pair[Surface], is_asked: BoolArray, first: int, params: ChangeParams
+) -> tuple[IntArray, IntArray]:
+    """Owners (m,) of this epoch's points with its small things, numbered from ``first``, and the host (t,) of each;
+    ``surfaces`` of this epoch and of the other."""
+    own, other = surfaces
+    member = np.flatnonzero(np.append(is_asked, False)[own.owner])
+    found, _ = nearest(other.xyz[other.is_surface], own.xyz[member], _POINT_M)
+    alone = member[found < 0]
+    if len(alone) == 0:
+        return own.owner, np.zeros(0, dtype=np.int32)
+    apart = own.owner[alone] * _LIFT_M  # no object is near another
+    cluster, k = consecutive(linked(own.xyz[alone] + np.outer(apart, _UP), _CONTACT_M))
+    plan = own.xyz[alone] * _FLAT
+    beneath, _ = nearest(other.xyz[~other.is_surface] * _FLAT, plan, _POINT_M)
+    groups = Groups(cluster, k)
+    low, high = groups.extremes(own.height[alone])
+    # what ends just beneath what still stands carries it: the pole of a sign, of which the other survey met the plate
+    top = np.flatnonzero(own.height[alone] >= high[cluster])
+    over, _ = nearest(other.xyz[other.is_surface], own.xyz[alone[top]] + _POINT_M * _UP, _POINT_M)
+    carries = Groups(cluster[top], k).share(over >= 0) > 0
+    is_thing = (groups.counts >= _LEAST_POINTS) & (groups.sum(own.n_raw[alone]) >= params.min_returns)
+    is_thing &= (low <= _FOOT_M) & (high > params.raised_m) & (high <= LOW_M)
+    is_thing &= (groups.share(beneath >= 0) >= _LEAST_NEW) & ~carries
+    number = np.full(k, -1, dtype=np.int32)
+    number[is_thing] = first + np.arange(np.count_nonzero(is_thing), dtype=np.int32)
+    owner = own.owner.copy()
+    owner[alone] = np.where(is_thing[cluster], number[cluster], owner[alone])
+    host = np.zeros(k, dtype=np.int32)
+    host[cluster] = own.owner[alone]
+    return owner, host[is_thing]
+
+
+_POINT_M = 0.38
+"""Points of one surface lie no farther apart, fused to 0.25 m: the diagonal of a voxel."""
+
+_FLAT, _UP, _LIFT_M = np.array([1.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), 100.0
+
+_LEAST_POINTS = 8
+"""Fused points of a thing."""
 
 
 def carried_on(surfaces: Pair[Surface], is_asked: BoolArray) -> IntArray:
