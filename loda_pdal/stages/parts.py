@@ -113,14 +113,15 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, 
     if params.thing_voxels > 0:  # which looks for what is lower
         is_plant &= np.fmax(*(Groups(side.owner, n).quantile(side.height, 0.95) for side in surfaces)) >= LOW_M
     is_split &= is_pair & ~is_plant
+    is_alone = ~is_pair & (object_class != ObjectClass.MOBILE)  # vehicles stand beside others, and are one body each
     own, clear = cells.owner, cells.voxels.is_clear
     size = params.part_min_voxels, params.part_min_width_m / params.voxel_m
     plant = 1, params.plant_width_m / params.voxel_m
     regions = [
         *connected_regions(cells, own, cells.is_lost, is_split, *size, is_clear=clear.after),
         *connected_regions(cells, own.swapped, cells.is_gained, is_split, *size, is_clear=clear.before),
-        *connected_regions(cells, own, cells.is_near.after, ~is_pair, *size),
-        *connected_regions(cells, own.swapped, cells.is_near.before, ~is_pair, *size),
+        *connected_regions(cells, own, cells.is_near.after, is_alone, *size),
+        *connected_regions(cells, own.swapped, cells.is_near.before, is_alone, *size),
     ]
     if is_plant.any():
         bare = cells.bare_columns
