@@ -205,8 +205,9 @@ def _divided(surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, p
         if params.fills_buildings:
             is_asked &= ~_is_line(cast)
         owner, host = split_things(cells, cast.surfaces, is_asked, params)
-        goes_to = cast.with_more(owner, host).smooth_only(host, must_show=params.fills_buildings)
-        owner = owner.map(lambda side: goes_to[side])
+        if params.fills_buildings:
+            goes_to = cast.with_more(owner, host).smooth_only(host)
+            owner = owner.map(lambda side: goes_to[side])
         cast = cast.with_more(owner, host)
         if params.needs_sight:
             cast = _with_close_things(cast, voxels, cells, params)
@@ -225,9 +226,7 @@ def _with_close_things(cast: Cast, voxels: Voxels, cells: Cells, params: ChangeP
     shown = cast.surfaces.join(near, lambda side, is_near: Groups(side.owner, len(cast)).share(is_near))
     is_asked = np.where(cast.is_pair, ~is_vehicle, np.fmax(*shown) >= params.min_support)
     is_asked &= cast.object_class != ObjectClass.BUILDING
-    owner, host = split_close_things(cast.surfaces, is_asked, params)
-    goes_to = cast.with_more(owner, host).smooth_only(host, must_show=False)
-    more = cast.with_more(owner.map(lambda side: goes_to[side]), host)
+    more = cast.with_more(*split_close_things(cast.surfaces, is_asked, params))
     return replace(more, is_apart=more.is_apart | (np.arange(len(more)) >= len(cast)))
 
 

@@ -155,7 +155,7 @@ def _close_things(
     over, _ = nearest(other.xyz[other.is_surface], own.xyz[alone[top]] + _POINT_M * _UP, _POINT_M)
     carries = Groups(cluster[top], k).share(over >= 0) > 0
     is_thing = (groups.counts >= _LEAST_POINTS) & (groups.sum(own.n_raw[alone]) >= params.min_returns)
-    is_thing &= (low <= _FOOT_M) & (high > params.raised_m) & (high <= LOW_M)
+    is_thing &= (low <= _LOW_FOOT_M) & (high > params.raised_m) & (high <= LOW_M)
     is_thing &= (groups.share(beneath >= 0) >= _LEAST_NEW) & ~carries
     number = np.full(k, -1, dtype=np.int32)
     number[is_thing] = first + np.arange(np.count_nonzero(is_thing), dtype=np.int32)
@@ -173,6 +173,9 @@ _FLAT, _UP, _LIFT_M = np.array([1.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), 100.
 
 _LEAST_POINTS = 8
 """Fused points of a thing."""
+
+_LOW_FOOT_M = 0.6
+"""Its lowest point lies no higher: no ray reaches the ground right beside a neighbour, and a hedge is cut above this."""
 
 
 def carried_on(surfaces: Pair[Surface], is_asked: BoolArray) -> IntArray:
