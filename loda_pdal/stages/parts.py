@@ -128,13 +128,9 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, 
         plants = connected_regions(cells, own, bare.after, is_plant, *plant)
         plants += connected_regions(cells, own.swapped, bare.before, is_plant, *plant)
         regions += [region for region in plants if region.share_new > 0.5]  # not a crown that rose
-    if not params.fills_buildings:
-        regions += [
-            region
-            for side in raised_regions(cells, has_houses & is_split)
-            for region in side
-            if region.n_voxels < params.part_min_voxels
-        ]
+    if params.needs_sight and not params.fills_buildings:
+        raised = raised_regions(cells, has_houses & is_split)
+        regions += [region for side in raised for region in side if region.n_voxels < params.part_min_voxels]
     is_of_bodies = params.fills_buildings and bool(has_houses.any())
     top = _tops(surfaces, columns_of[0], params.voxel_m) if is_of_bodies else None
     columns, part, parent, is_house, is_extension = _claim(
@@ -161,24 +157,24 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, 
 def largest_regions(cells: Cells, n: int, params: ChangeParams) -> Pair[FloatArray]:
     """Volume (n,) m3 of the largest region that each object lost (before) and gained (after): solid ones of buildings
     that are filled; else surfaces have no inside, and only what stood on them counts, see `raised_regions`."""
-    everyone = np.ones(n, np.bool_)
-    if not params.fills_buildings:
-        volume = np.zeros((2, n))
-        for side, found in zip(volume, raised_regions(cells, everyone), strict=True):
-            for region in found:
-                side[region.parent] = max(side[region.parent], region.n_voxels * params.voxel_m**3)
-        return Pair(*volume)
-    width = params.part_min_width_m / params.voxel_m
+    everyone, width = np.ones(n, np.bool_), params.part_min_width_m / params.voxel_m
+    least, own, clear = params.part_min_voxels, cells.owner, cells.voxels.is_clear
+    regions: Pair[list[Region]] = Pair([], [])
+    if params.fills_buildings:
+        regions = Pair(
+            connected_regions(cells, own, cells.is_lost, everyone, least, width, is_clear=clear.after),
+            connected_regions(cells, own.swapped, cells.is_gained, everyone, least, width, is_clear=clear.before),
+        )
+    elif params.needs_sight:
+        regions = raised_regions(cells, everyone)
 
-    def largest(owner: Pair[IntArray], is_in: BoolArray, is_clear: BoolArray) -> FloatArray:
+    def largest(found: list[Region]) -> FloatArray:
         volume = np.zeros(n)
-        least = params.part_min_voxels
-        for region in connected_regions(cells, owner, is_in, everyone, least, width, is_clear=is_clear):
+        for region in found:
             volume[region.parent] = max(volume[region.parent], region.n_voxels * params.voxel_m**3)
         return volume
 
-    own, clear = cells.owner, cells.voxels.is_clear
-    return Pair(largest(own, cells.is_lost, clear.after), largest(own.swapped, cells.is_gained, clear.before))
+    return regions.map(largest)
 
 
 def raised_regions(cells: Cells, is_asked: BoolArray) -> Pair[list[Region]]:
