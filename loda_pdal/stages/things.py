@@ -167,7 +167,7 @@ def _close_things(
     return owner, pieces[is_new, 1].astype(np.int32)
 
 
-def _whole(side: Surface, piece: Int64Array, label: Int64Array, host: Int64Array, is_single: BoolArray) -> IntArray:
+def _whole(side: Surface, piece: Int64Array, label: Int64Array, host: IntArray, is_single: BoolArray) -> IntArray:
     """Object (k,) of one epoch that the points ``piece`` (p,) with a ``label`` (p,) touch most, but for the ``host``
     (k,) of each label; -1 where there is none."""
     found = np.full(len(host), -1, dtype=np.int32)
