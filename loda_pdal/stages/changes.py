@@ -224,7 +224,7 @@ def _with_close_things(cast: Cast, voxels: Voxels, cells: Cells, params: ChangeP
     is_vehicle = (cast.object_class == ObjectClass.MOBILE) & looks_like_vehicle(cast.surfaces, len(cast))
     near = voxels.at_points(cells.is_near.swapped, cast.surfaces)
     shown = cast.surfaces.join(near, lambda side, is_near: Groups(side.owner, len(cast)).share(is_near))
-    is_asked = np.where(cast.is_pair, ~is_vehicle, np.fmax(*shown) >= params.min_support)
+    is_asked = np.where(cast.is_pair, ~is_vehicle, ~cast.is_apart & (np.fmax(*shown) >= params.min_support))
     is_asked &= cast.object_class != ObjectClass.BUILDING
     more = cast.with_more(*split_close_things(cast.surfaces, is_asked, ~cast.is_pair, params))
     return replace(more, is_apart=more.is_apart | (np.arange(len(more)) >= len(cast)))
