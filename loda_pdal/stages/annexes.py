@@ -31,7 +31,13 @@ _STILL_SEEN = 0.9
 
 
 def are_built_on(
-    cells: Cells, surfaces: Pair[Surface], parent: IntArray, is_asked: BoolArray, *, has_walls: bool
+    cells: Cells,
+    surfaces: Pair[Surface],
+    parent: IntArray,
+    is_asked: BoolArray,
+    is_on_top: BoolArray,
+    *,
+    has_walls: bool,
 ) -> BoolArray:
     """Which of the parts of houses ``is_asked`` (n,) are solid: what came or went of them is smooth and hid the wall.
 
@@ -43,12 +49,14 @@ def are_built_on(
         Points with their objects, 0 to ``n - 1``.
     parent : (n,) int32
         The house of each part.
+    is_on_top : (n,) bool
+        Parts that stand on the house: too small to be smooth, a dormer is all edges.
     has_walls : bool
         Whether the surveys show walls: from the air there are hardly any to see through what stands before them.
     """
     came_or_went = cells.voxels.at_points(Pair(cells.is_lost, cells.is_gained), surfaces)
     new = surfaces.join(came_or_went, lambda side, is_new: side.only(is_new & np.append(is_asked, False)[side.owner]))
-    is_smooth = np.asarray(is_asked & (roughness(new, is_asked) < FOLIAGE_M))
+    is_smooth = np.asarray(is_asked & (is_on_top | (roughness(new, is_asked) < FOLIAGE_M)))
     if not has_walls:
         return is_smooth
     is_open = _is_seen_through(new.before, surfaces, parent) | _is_seen_through(new.after, surfaces.swapped, parent)
