@@ -6,13 +6,13 @@ import sys
 
 import numpy as np
 
-from loda_pdal import Parameters, detect_changes, read_epochs
+from loda_pdal import detect_changes, read_epochs
 
 
 def main(before: str, after: str, epsg: str | None = None) -> None:
     """Print the ten changes with the largest outline, with their reasons."""
     surveys = read_epochs(before, after, epsg=int(epsg) if epsg else None)
-    result = detect_changes(surveys.before, surveys.after, Parameters.preset("street"))
+    result = detect_changes(surveys.before, surveys.after)
     for warning in result.warnings:
         print("warning:", warning)
     for change in sorted(result.changes, key=lambda change: -change.footprint.area)[:10]:

@@ -683,8 +683,11 @@ class Parameters:
         return cls().with_values(_PRESET_VALUES[name], where=f"preset {name}")
 
     @classmethod
-    def load(cls, path: Path, base: Parameters | None = None) -> Parameters:
-        """Parameters from a TOML or JSON file, over ``base`` (the street preset); unknown keys are errors."""
+    def load(cls, path: Path, base: Parameters | None = None, otherwise: str = "street") -> Parameters:
+        """Parameters from a TOML or JSON file, over ``base``; unknown keys are errors.
+
+        Without ``base`` over the preset that the file names, and over ``otherwise`` where it names none.
+        """
         try:
             text = path.read_text(encoding="utf-8")
             values = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
@@ -704,7 +707,8 @@ class Parameters:
                 "Start from `loda-pdal params -o FILE`.",
                 "params-unreadable",
             )
-        start = cls.preset(str(values["name"])) if base is None and values.get("name") in PRESETS else base or cls()
+        named = values.get("name")
+        start = base or cls.preset(str(named) if named in PRESETS else otherwise)
         return start.with_values(values, where=str(path))
 
     def with_values(self, values: Mapping[str, Any], where: str = "parameters") -> Parameters:

@@ -31,10 +31,11 @@ from loda_pdal.model.registration import Registration
 from loda_pdal.model.survey import Survey
 from loda_pdal.model.transform import transform_points
 from loda_pdal.params import ChangeParams, Parameters
-from loda_pdal.preset_choice import doubts_about
+from loda_pdal.preset_choice import doubts_about, preset_for
 from loda_pdal.stages.association import Descriptors, Matches, associate, describe
 from loda_pdal.stages.changes import Changes, decide_changes
 from loda_pdal.stages.correspondence import Objects, match_instances
+from loda_pdal.stages.crowns import Crowns, find_crowns
 from loda_pdal.stages.cues import Surface
 from loda_pdal.stages.features import Features, eigen_features
 from loda_pdal.stages.filling import bodies, filled, filled_everywhere
@@ -83,7 +84,7 @@ def detect_changes(
     before, after : Survey
         Both epochs in one local frame, see `read_epochs`.
     parameters : Parameters, optional
-        Choices of the method; the ``street`` preset if left out.
+        Choices of the method; the preset that suits the surveys (`preset_for`) if left out.
     progress : callable, optional
         ``progress(done, total, text)``, called before each step and at the end.
 
@@ -93,7 +94,7 @@ def detect_changes(
         Objects, changed ground, and values for every raw point, in local metres of the after frame.
     """
     surveys = Pair(before, after)
-    p = resolve(parameters or Parameters(), surveys)
+    p = resolve(parameters or Parameters.preset(preset_for(surveys).name), surveys)
     clock = StepClock(progress)
     with clock("fuse"):
         fused = fuse_epochs(surveys, p)
@@ -230,12 +231,15 @@ def classify_superpoints(clouds: Pair[VoxelCloud], segments: Pair[Segments], p: 
 def segment_instances(
     clouds: Pair[VoxelCloud], ground: Pair[Ground], classes: Pair[Semantics], p: Parameters
 ) -> Pair[Instances]:
-    """Instances within each class (section 4.2)."""
+    """Instances within each class (section 4.2); touching crowns part in both where one epoch shows it."""
+    is_plant = classes.map(lambda side: side.classification == ObjectClass.VEGETATION)
+    plants = clouds.join(is_plant, lambda cloud, asked: cloud.xyz[asked])
+    crowns = find_crowns(plants, ground.join(is_plant, lambda g, asked: g.height[asked]))
 
-    def of_epoch(cloud: VoxelCloud, g: Ground, semantics: Semantics) -> Instances:
-        return form_instances(cloud.xyz, cloud.n_raw, g.height, semantics, p.instances, p.semantics)
+    def of_epoch(cloud: VoxelCloud, g: Ground, semantics: Semantics, own: Crowns) -> Instances:
+        return form_instances(cloud.xyz, cloud.n_raw, g.height, semantics, own, p.instances, p.semantics)
 
-    return at_once(of_epoch, clouds, ground, classes)
+    return at_once(of_epoch, clouds, ground, classes, crowns)
 
 
 def match_objects(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -188,6 +188,31 @@ def test_a_stem_before_a_house_does_not_change_it() -> None:
     assert labels(found)[int(found.owner.after[0])] == ChangeLabel.UNCHANGED
 
 
+def gable(with_dormer: bool) -> tuple[FloatArray, FloatArray]:
+    """A house with a roof that rises from its front at 3 m, and with a dormer 2 m wide on it or not."""
+    walls = block(0, 0, 6, 6, 3)
+    is_wall = walls[0][:, 2] < 3
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(0.125, 6, 0.25), np.arange(0.125, 6, 0.25), indexing="ij"))
+    is_front = with_dormer & (x > 2) & (x < 4) & (y < 2.5)
+    roof = np.column_stack([x, y, np.where(is_front, 5.5, 3.0 + 0.8 * y)])
+    tilted = np.where(is_front[:, None], [0.0, 0.0, 1.0], np.array([0.0, -0.8, 1.0]) / np.hypot(1, 0.8))
+    front = np.stack(np.meshgrid(np.arange(2.125, 4, 0.25), [0.0], np.arange(3.125, 5.5, 0.25)), -1).reshape(-1, 3)
+    front = front[: len(front) * with_dormer]
+    return joined(
+        (walls[0][is_wall], walls[1][is_wall]), (roof, tilted), (front, np.tile((0.0, -1.0, 0.0), (len(front), 1)))
+    )
+
+
+def test_a_dormer_changes_its_house_and_an_edge_one_column_wide_does_not() -> None:
+    before, after = surface((0, gable(False))), surface((0, gable(True)))
+    there, back = decide(before, after, ObjectClass.BUILDING), decide(after, before, ObjectClass.BUILDING)
+    assert set(labels(there)) == {ChangeLabel.INCREASED}
+    assert [label.swapped for label in labels(there)] == labels(back)
+    gutter = block(0, 0, 6, 0.25, 4)
+    edge = decide(before, surface((0, joined(gable(False), gutter))), ObjectClass.BUILDING)
+    assert labels(edge)[int(edge.owner.before[-len(GROUND) - 1])] == ChangeLabel.UNCHANGED
+
+
 def test_one_of_a_pair_of_houses_is_removed_and_the_other_stays() -> None:
     neighbour = block(7, 0, 7, 8, 6)
     house = block(0, 0, 7, 8, 6)
@@ -298,6 +323,75 @@ def test_of_two_houses_that_touch_one_is_removed_and_the_other_stays() -> None:
     assert [label.swapped for label in labels(found)] == labels(decide(after, before, ObjectClass.BUILDING))
 
 
+def pent_shed(x: float, y: float, fall: float) -> tuple[FloatArray, FloatArray]:
+    """What a survey shows of a shed against a wall at ``y``: front and sides, under a roof that falls to the wall."""
+    points, normals = block(x, y - 2, 2.5, 2.0, 3.0)
+    depth = y - points[:, 1]
+    is_shown = (depth > 0) & (points[:, 2] <= 2.3 + fall * depth) & (normals[:, 2] == 0)
+    return points[is_shown], normals[is_shown]
+
+
+@pytest.mark.parametrize(
+    ("fall", "house", "part"),
+    [
+        (0.0, ChangeLabel.INCREASED, ChangeLabel.INCREASED),
+        (0.25, ChangeLabel.UNCHANGED, ChangeLabel.ADDED),
+        (-0.25, ChangeLabel.INCREASED, ChangeLabel.INCREASED),
+    ],
+    ids=["level", "towards the wall", "away from it"],
+)
+def test_a_roof_that_falls_towards_the_wall_is_no_annex(fall: float, house: ChangeLabel, part: ChangeLabel) -> None:
+    x, y, z = HOUSE[0].T
+    is_hidden = (x > 2) & (x < 4.5) & (y == 0) & (z < 2.3)
+    hidden = HOUSE[0][~is_hidden], HOUSE[1][~is_hidden]
+    before, after = surface((0, HOUSE)), surface((0, joined(hidden, pent_shed(2, 0, fall))))
+    found = decide(before, after, ObjectClass.BUILDING)
+    of_house = int(found.owner.before[np.flatnonzero(y > 2)[0]])
+    assert labels(found)[of_house] == house
+    assert [label for i, label in enumerate(labels(found)) if i != of_house] == [part]
+    assert [label.swapped for label in labels(found)] == labels(decide(after, before, ObjectClass.BUILDING))
+
+
+def test_a_sliver_of_a_wall_is_no_part_of_a_house() -> None:
+    """A stack of voxels up a side wall that one survey met and the other did not."""
+    sliver = block(10.3, 1.0, 0.25, 0.5, 5.5)
+    found = decide(surface((0, joined(HOUSE, sliver))), surface((0, HOUSE)), ObjectClass.BUILDING)
+    assert labels(found) == [ChangeLabel.UNCHANGED]
+
+
+def test_a_shed_that_was_paired_with_the_house_beside_it_stays_when_the_house_goes() -> None:
+    house, shed = block(0, 0, 12, 9, 8), block(12.5, 0, 2.5, 2, 2.5)
+    found = decide(surface((0, joined(house, shed))), surface((0, shed)), ObjectClass.BUILDING)
+    assert set(labels(found)) == {ChangeLabel.UNCHANGED, ChangeLabel.REMOVED}
+    assert all(labels(found)[i] == ChangeLabel.UNCHANGED for i in set(found.owner.after[: len(shed[0])].tolist()))
+
+
+def without_ground(side: Surface, low: float, high: float) -> Surface:
+    """The same survey, which shows no ground between ``low`` and ``high`` along x."""
+    is_kept = (side.owner >= 0) | (side.xyz[:, 0] < low) | (side.xyz[:, 0] > high)
+    return Surface(*(getattr(side, item.name)[is_kept] for item in fields(side)))
+
+
+def test_what_stands_in_the_shadow_of_something_has_neither_come_nor_gone() -> None:
+    """A car that one survey shows, where the other shows nothing of the ground beside it: a lorry stood before both."""
+    car = block(10, 0, 4.5, 1.8, 1.5)
+    there, bare = surface((0, car)), surface()
+    assert labels(decide(there, bare, ObjectClass.MOBILE)) == [ChangeLabel.REMOVED]
+    found = decide(there, without_ground(bare, 5, 20), ObjectClass.MOBILE)
+    assert labels(found) == [ChangeLabel.UNDETERMINED]
+    assert labels(decide(without_ground(bare, 5, 20), there, ObjectClass.MOBILE)) == [ChangeLabel.UNDETERMINED]
+
+
+def test_what_both_surveys_show_of_a_thing_is_unchanged_however_little_of_the_rest_one_saw() -> None:
+    row = block(0, 0, 45, 8, 6)
+    is_near = row[0][:, 0] < 6
+    near = coverage(GROUND[GROUND[:, 0] < 5], ObservabilityParams())
+    before, after = surface((0, (row[0][is_near], row[1][is_near]))), surface((0, row))
+    found = decide(before, after, ObjectClass.BUILDING, seen=Pair(near, everywhere()))
+    assert found.evidence.observability[0] < STREET.observability.min_observability
+    assert labels(found) == [ChangeLabel.UNCHANGED]
+
+
 def test_a_porch_on_a_row_changes_one_frontage_of_it() -> None:
     row = block(0, 0, 40, 8, 6)
     is_hidden = (np.abs(row[0][:, 0] - 21.25) < 1.25) & (row[0][:, 1] == 0) & (row[0][:, 2] < 2.75)
@@ -333,6 +427,46 @@ def test_a_bin_at_the_end_of_a_hedge_is_a_thing_of_its_own() -> None:
     stays, box = hedge(0, 4), block(4.25, 0, 0.75, 0.75, 1.25)
     found = decide(surface((0, joined(stays, box))), surface((0, stays)), ObjectClass.OTHER)
     assert labels(found) == [ChangeLabel.UNCHANGED, ChangeLabel.REMOVED]
+
+
+@pytest.mark.parametrize("both_have", [True, False])
+def test_a_bicycle_against_a_bench_is_a_thing_of_its_own(both_have: bool) -> None:
+    """All of it lies within reach of the bench, and the bench of none of its points."""
+    bench, bicycle = block(0, 0, 2, 0.5, 0.75), block(0.25, -0.5, 1.5, 0.05, 1.0)
+    other = surface((0 if both_have else -1, bench))
+    other = replace(other, is_surface=other.xyz[:, 2] > 0)
+    with_it = surface((0, joined(bench, bicycle) if both_have else bicycle))
+    there, back = decide(with_it, other, ObjectClass.OTHER), decide(other, with_it, ObjectClass.OTHER)
+    for found, side, label in ((there, "before", ChangeLabel.REMOVED), (back, "after", ChangeLabel.ADDED)):
+        owner = getattr(found.owner, side)[: len(with_it.xyz) - len(GROUND)]
+        told = found.label[owner][-len(bicycle[0]) :]
+        assert np.mean(told == label) > 0.8
+        if both_have:
+            assert np.all(found.label[owner][: len(bench[0])] == ChangeLabel.UNCHANGED)
+
+
+def test_the_pole_of_a_sign_of_which_the_other_survey_met_the_plate_has_not_come() -> None:
+    pole, plate = block(0, 0, 0.05, 0.05, 1.75), block(-0.25, 0, 0.5, 0.05, 0.75)
+    plate = plate[0] + [0.0, 0.0, 1.75], plate[1]
+    box = block(0.6, 0, 1, 1, 1)
+    found = decide(surface((0, joined(plate, box))), surface((0, joined(plate, box, pole))), ObjectClass.OTHER)
+    assert labels(found) == [ChangeLabel.UNCHANGED]
+
+
+def test_a_plant_beside_another_is_a_thing_of_its_own_on_the_street() -> None:
+    rng = np.random.default_rng(3)
+    bushes = [(rng.random((150, 3)) * [1.4, 1.4, 0.9] + [x, 0.0, 0.0], rng.normal(size=(150, 3))) for x in (0.0, 2.2)]
+    one, other = ((points, n / np.linalg.norm(n, axis=1, keepdims=True)) for points, n in bushes)
+    found = decide(surface((0, one)), surface((0, joined(one, other))), ObjectClass.VEGETATION)
+    assert labels(found) == [ChangeLabel.UNCHANGED, ChangeLabel.ADDED]
+
+
+def test_no_part_of_a_new_vehicle_is_taken_for_those_that_it_stands_between() -> None:
+    cars = [block(0, 0, 4.5, 1.8, 1.5), block(4.9, 0, 4.5, 1.8, 1.5), block(9.8, 0, 4.5, 1.8, 1.5)]
+    before = surface((0, cars[0]), (1, cars[2]))
+    after = surface((0, cars[0]), (1, cars[2]), (2, cars[1]))
+    found = decide(before, after, *[ObjectClass.MOBILE] * 3)
+    assert sorted(labels(found)) == [ChangeLabel.UNCHANGED, ChangeLabel.UNCHANGED, ChangeLabel.ADDED]
 
 
 def test_one_of_two_vehicles_in_one_piece_leaves_alone() -> None:

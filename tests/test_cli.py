@@ -103,12 +103,27 @@ def test_usage_errors_exit_with_2(arguments: list[str], capsys: pytest.CaptureFi
 def test_auto_says_which_preset_suits_the_surveys(
     two_surveys: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = ["detect", *two_surveys, "-o", str(tmp_path / "out"), "--preset", "auto", "--validate"]
-    assert run(arguments) == 0
-    assert "Preset aerial: the densest quarter of the plan holds 42% and 43% of" in " ".join(
-        capsys.readouterr().err.split()
-    )
+    arguments = ["detect", *two_surveys, "-o", str(tmp_path / "out"), "--validate"]
+    for choice in ([], ["--preset", "auto"]):
+        assert run([*arguments, *choice]) == 0
+        assert "Preset aerial: the densest quarter of the plan holds 42% and 43% of" in " ".join(
+            capsys.readouterr().err.split()
+        )
+    assert run([*arguments, "--preset", "street"]) == 0
+    assert "Preset" not in capsys.readouterr().err
     assert run([*arguments, "--set", "lod.radius=1"]) == 1
+
+
+def test_a_parameter_file_chooses_before_the_surveys_do(tmp_path: Path) -> None:
+    named, unnamed = tmp_path / "named.toml", tmp_path / "unnamed.toml"
+    unnamed.write_text("[lod]\nradius_m = 1.5\n", encoding="utf-8")
+    named.write_text('name = "street"\n[lod]\nradius_m = 1.5\n', encoding="utf-8")
+    aerial, street = (Parameters.preset(name).with_setting("lod.radius_m=1.5") for name in ("aerial", "street"))
+    for preset in (None, "auto"):
+        assert chosen_parameters(preset, named, (), suits="aerial") == street
+        assert chosen_parameters(preset, unnamed, (), suits="aerial") == aerial
+    assert chosen_parameters("street", unnamed, (), suits="aerial") == street
+    assert chosen_parameters(None, None, ("lod.radius_m=1.5",), suits="aerial") == aerial
 
 
 DETECT = ("detect", "{here}/before.laz", "{here}/after.laz", "-o", "{here}/out")

@@ -42,7 +42,7 @@ def check(points: laspy.LasData, result: ChangeResult) -> None:
 
 def test_the_command(block: Path, result: ChangeResult, tmp_path: Path) -> None:
     arguments = ["detect", str(block / "before.laz"), str(block / "after.laz"), "-o", str(tmp_path / "out")]
-    assert run([*arguments, "--preset", "auto", "-q"]) == 0
+    assert run([*arguments, "-q"]) == 0
     about = json.loads((tmp_path / "out" / "run.json").read_text())["run"]
     assert about["preset"] == "street" and "densest quarter of the plan" in about["preset_reason"]
     check(laspy.read(tmp_path / "out" / "changes.laz"), result)
@@ -54,7 +54,7 @@ def test_the_pipeline(engine: str, block: Path, result: ChangeResult, pipelines_
         "stage.before.filename": str(block / "before.laz"),
         "stage.after.filename": str(block / "after.laz"),
         "stage.output.filename": str(tmp_path / "out.laz"),
-        "filters.python.pdalargs": json.dumps({"run": str(tmp_path / "run"), "preset": "auto"}),
+        "filters.python.pdalargs": json.dumps({"run": str(tmp_path / "run")}),
     }
     assert run_pipeline(pipelines_dir / "change.json", overrides, engine=engine).engine == engine
     check(laspy.read(tmp_path / "out.laz"), result)

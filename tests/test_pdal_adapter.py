@@ -146,11 +146,12 @@ def test_arguments_choose_the_parameters() -> None:
 def test_auto_takes_the_preset_that_suits_the_points() -> None:
     from loda_pdal.pdal_face.run import Arguments
 
-    parsed = Arguments.parse({"preset": "auto", "set": {"lod.radius_m": 1.5}})
     even = Survey(np.random.default_rng(0).uniform(0.0, (60.0, 60.0, 8.0), (9000, 3)))
-    chosen = parsed.for_surveys(Pair(even, even))
-    assert (chosen.name, chosen.lod.radius_m, chosen.fuse.leaf_m) == ("aerial", 1.5, 0.5)
-    assert parsed.parameters.name == "street"
+    for choice in ({}, {"preset": "auto"}):
+        parsed = Arguments.parse({**choice, "set": {"lod.radius_m": 1.5}})
+        chosen = parsed.for_surveys(Pair(even, even))
+        assert (chosen.name, chosen.lod.radius_m, chosen.fuse.leaf_m) == ("aerial", 1.5, 0.5)
+    assert Arguments.parse({"preset": "street"}).for_surveys(Pair(even, even)).name == "street"
 
 
 def test_an_unknown_entry_is_named() -> None:

@@ -13,14 +13,15 @@ from loda_pdal.kernels.rasters import highest_range
 from loda_pdal.model.cloud import FloatArray, IntArray, to_local_grid
 from loda_pdal.model.groups import Groups
 from loda_pdal.model.labels import ObjectClass
+from loda_pdal.model.pair import Pair
 from loda_pdal.params import FuseParams, Parameters
+from loda_pdal.stages.crowns import find_crowns
 from loda_pdal.stages.features import eigen_features
 from loda_pdal.stages.fuse import fuse_points
 from loda_pdal.stages.instances import (
     Instances,
     euclidean_clusters,
     form_instances,
-    split_crowns,
     with_whole_bodies,
 )
 from loda_pdal.stages.semantics import classify, fit_planes, split_at_edges, support_area, touching
@@ -73,7 +74,9 @@ def scene() -> Scene:
     features = eigen_features(cloud.xyz, height, STREET.features)
     found = superpoints(cloud.xyz, features, STREET.superpoints)
     semantics = classify(cloud.xyz, 0.25, features, found.labels, found.n, STREET.semantics)
-    instances = form_instances(cloud.xyz, cloud.n_raw, height, semantics, STREET.instances, STREET.semantics)
+    is_plant = semantics.classification == ObjectClass.VEGETATION
+    crowns = find_crowns(Pair(cloud.xyz[is_plant], cloud.xyz[:0]), Pair(height[is_plant], height[:0])).before
+    instances = form_instances(cloud.xyz, cloud.n_raw, height, semantics, crowns, STREET.instances, STREET.semantics)
     return Scene(cloud.xyz, truth, instances)
 
 
@@ -127,23 +130,6 @@ def test_clusters_agree_with_all_pairs() -> None:
     expected = components(links, 400)
     found = euclidean_clusters(xyz, 0.7, reach)
     assert len(set(zip(expected.tolist(), found.tolist(), strict=True))) == expected.max() + 1 == found.max() + 1
-
-
-def test_touching_crowns_are_two_trees_and_a_hedge_stays_whole() -> None:
-    rng = np.random.default_rng(2)
-
-    def dome(x: float, top: float) -> FloatArray:
-        xy = rng.uniform(-2.5, 2.5, (1500, 2))
-        return np.column_stack([xy + np.array([x, 0.0]), top - 0.4 * np.sum(xy**2, axis=1)])
-
-    trees = np.concatenate([dome(0, 8), dome(4.5, 7)])
-    found = split_crowns(trees, trees[:, 2], np.zeros(len(trees), np.int32))
-    left, right = found[np.abs(trees[:, 0]) < 1], found[np.abs(trees[:, 0] - 4.5) < 1]
-    assert len(set(left.tolist())) == 1
-    assert len(set(right.tolist())) == 1
-    assert left[0] != right[0]
-    hedge = np.column_stack([rng.uniform(0, 20, 2000), rng.uniform(0, 1, 2000), rng.uniform(0, 1.5, 2000)])
-    assert (split_crowns(hedge, hedge[:, 2], np.zeros(2000, np.int32)) == 0).all()
 
 
 def test_planes_and_their_support() -> None:

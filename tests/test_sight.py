@@ -226,13 +226,14 @@ def test_surveys_with_trajectories_can_be_swapped_too(tmp_path: Path) -> None:
     paths, ways = write_scene(tmp_path), write_trajectories(tmp_path)
     surveys = read_epochs(*paths, trajectories=ways)
     assert "knows where the sensor was for 100.0%" in surveys.before.notes[-1]
-    forth = detect_changes(surveys.before, surveys.after)
-    back = detect_changes(surveys.after, surveys.before)
+    street = Parameters.preset("street")
+    forth = detect_changes(surveys.before, surveys.after, street)
+    back = detect_changes(surveys.after, surveys.before, street)
     assert len(forth.objects) > 0
     assert [o.observability for o in forth.objects] == [o.observability for o in back.objects]
     plain = read_epochs(*paths)
-    by_columns = Parameters().with_setting("observability.method=coverage")
-    expected = detect_changes(plain.before, plain.after)
+    by_columns = street.with_setting("observability.method=coverage")
+    expected = detect_changes(plain.before, plain.after, street)
     found = detect_changes(surveys.before, surveys.after, by_columns)
     assert [(o.label, o.reason) for o in found.objects] == [(o.label, o.reason) for o in expected.objects]
 

@@ -79,8 +79,7 @@ def detect(
     with reporter_for(progress_kind) as reporter:
         if progress_kind == "json":
             stopping.when_parent_dies()
-        is_auto = preset == AUTO
-        parameters = options.chosen_parameters(None if is_auto else preset, params_file, settings)
+        parameters = options.chosen_parameters(preset, params_file, settings)
         from loda_pdal.io.outputs import check_output_folder
         from loda_pdal.model.pair import Pair
 
@@ -88,13 +87,14 @@ def detect(
         trajectories = Pair(trajectory_before, trajectory_after)
         surveys = _read(reporter, before, after, trajectories, parameters, epsg, assume_same_crs, max_memory)
         run_info: dict[str, Any] = {"command": ["loda-pdal", *sys.argv[1:]]}
-        if is_auto:
+        if preset in (None, AUTO):
             from loda_pdal.preset_choice import preset_for
 
             suits = preset_for(surveys)
-            reporter.info(f"Preset {suits.name}: {suits.reason}.")
-            run_info["preset_reason"] = suits.reason
-            parameters = options.chosen_parameters(suits.name, params_file, settings)
+            parameters = options.chosen_parameters(preset, params_file, settings, suits.name)
+            if parameters.name == suits.name:
+                reporter.info(f"Preset {suits.name}: {suits.reason}.")
+                run_info["preset_reason"] = suits.reason
         if validate:
             reporter.info("Everything is in order; nothing was computed.")
             return

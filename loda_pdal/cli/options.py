@@ -22,7 +22,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 _MADE_FOR = {
-    "street": "vehicle LiDAR (the default)",
+    "street": "vehicle LiDAR",
     "aerial": "airborne LiDAR",
     "paper": "the paper to the letter",
     AUTO: "street or aerial, whichever the surveys look like",
@@ -33,6 +33,7 @@ def parameters(*presets: str) -> Callable[[F], F]:
     """``--preset`` (one of ``presets``), ``--params`` and ``--set``, handed on as ``preset``, ``params_file`` and
     ``settings``."""
     made_for = "; ".join(f"{name}: {_MADE_FOR[name]}" for name in presets)
+    left_out = AUTO if AUTO in presets else "street"
     chosen = (
         click.option(
             "--set",
@@ -51,7 +52,7 @@ def parameters(*presets: str) -> Callable[[F], F]:
         click.option(
             "--preset",
             type=click.Choice(presets),
-            help=f"Where to start from. {made_for}.",
+            help=f"Where to start from; {left_out} if left out. {made_for}.",
         ),
     )
 
@@ -63,10 +64,15 @@ def parameters(*presets: str) -> Callable[[F], F]:
     return decorated
 
 
-def chosen_parameters(preset: str | None, params_file: Path | None, settings: Sequence[str]) -> Parameters:
-    """Parameters as the three options choose them; `ParameterError` for what is unknown or out of range."""
-    base = Parameters.preset(preset) if preset else None
-    chosen = Parameters.load(params_file, base) if params_file else base or Parameters()
+def chosen_parameters(
+    preset: str | None, params_file: Path | None, settings: Sequence[str], suits: str = "street"
+) -> Parameters:
+    """Parameters as the three options choose them; `ParameterError` for what is unknown or out of range.
+
+    ``suits`` names the preset that the surveys look like: it stands in where no option chooses one.
+    """
+    base = None if preset in (None, AUTO) else Parameters.preset(preset)
+    chosen = Parameters.load(params_file, base, suits) if params_file else base or Parameters.preset(suits)
     for setting in settings:
         chosen = chosen.with_setting(setting)
     return chosen

@@ -63,7 +63,7 @@ class Arguments:
     parameters : Parameters
         From ``preset``, ``params`` (a file) and ``set`` (``{"lod.radius_m": 1.5}``).
     is_auto : bool
-        The preset is the one that suits the surveys, see `for_surveys`.
+        No preset was chosen: the one that suits the surveys is taken, see `for_surveys`.
     epsg : int or None
         CRS of both surveys, whatever their files say.
     assume_same_crs : bool
@@ -86,8 +86,8 @@ class Arguments:
             raise ParameterError(
                 f"pdalargs: unknown name {unknown[0]!r}.", f"Known are {', '.join(known)}.", "pdalargs-invalid"
             )
-        is_auto = given.get("preset") == AUTO
-        parameters = _chosen({**given, "preset": "street"} if is_auto else given)
+        is_auto = given.get("preset", AUTO) == AUTO
+        parameters = _chosen(given)
         run, epsg = given.get("run"), given.get("epsg")
         if epsg is not None and (not isinstance(epsg, int) or isinstance(epsg, bool)):
             raise ParameterError(f"pdalargs: epsg is {epsg!r}.", 'Write "epsg": 28992.', "pdalargs-invalid")
@@ -99,15 +99,19 @@ class Arguments:
         if not self.is_auto:
             return self.parameters
         suits = preset_for(surveys)
-        logger.info("Preset %s: %s.", suits.name, suits.reason)
-        return _chosen({**self.given, "preset": suits.name})
+        parameters = _chosen(self.given, suits.name)
+        if parameters.name == suits.name:
+            logger.info("Preset %s: %s.", suits.name, suits.reason)
+        return parameters
 
 
-def _chosen(given: Mapping[str, Any]) -> Parameters:
-    """Parameters as ``preset``, ``params`` and ``set`` choose them."""
-    parameters = Parameters.preset(str(given.get("preset", "street")))
+def _chosen(given: Mapping[str, Any], suits: str = "street") -> Parameters:
+    """Parameters as ``preset``, ``params`` and ``set`` choose them, ``suits`` where neither names a preset."""
+    preset = given.get("preset", AUTO)
+    base = None if preset == AUTO else Parameters.preset(str(preset))
+    parameters = base or Parameters.preset(suits)
     if given.get("params"):
-        parameters = Parameters.load(Path(str(given["params"])), None if "preset" not in given else parameters)
+        parameters = Parameters.load(Path(str(given["params"])), base, suits)
     settings = given.get("set", {})
     if not isinstance(settings, Mapping):
         raise ParameterError("pdalargs: set is no table.", 'Write "set": {"lod.radius_m": 1.5}.', "pdalargs-invalid")

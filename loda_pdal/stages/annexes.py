@@ -10,7 +10,7 @@ import numpy as np
 
 from loda_pdal.kernels.neighbours import nearest
 from loda_pdal.model.boxes import upright_boxes
-from loda_pdal.model.cloud import BoolArray, IntArray
+from loda_pdal.model.cloud import BoolArray, FloatArray, IntArray
 from loda_pdal.model.groups import Groups
 from loda_pdal.model.pair import Pair
 from loda_pdal.stages.cast import FOLIAGE_M
@@ -31,7 +31,13 @@ _STILL_SEEN = 0.9
 
 
 def are_built_on(
-    cells: Cells, surfaces: Pair[Surface], parent: IntArray, is_asked: BoolArray, *, has_walls: bool
+    cells: Cells,
+    surfaces: Pair[Surface],
+    parent: IntArray,
+    is_asked: BoolArray,
+    is_on_top: BoolArray,
+    *,
+    has_walls: bool,
 ) -> BoolArray:
     """Which of the parts of houses ``is_asked`` (n,) are solid: what came or went of them is smooth and hid the wall.
 
@@ -43,12 +49,14 @@ def are_built_on(
         Points with their objects, 0 to ``n - 1``.
     parent : (n,) int32
         The house of each part.
+    is_on_top : (n,) bool
+        Parts that stand on the house: too small to be smooth, a dormer is all edges.
     has_walls : bool
         Whether the surveys show walls: from the air there are hardly any to see through what stands before them.
     """
     came_or_went = cells.voxels.at_points(Pair(cells.is_lost, cells.is_gained), surfaces)
     new = surfaces.join(came_or_went, lambda side, is_new: side.only(is_new & np.append(is_asked, False)[side.owner]))
-    is_smooth = np.asarray(is_asked & (roughness(new, is_asked) < FOLIAGE_M))
+    is_smooth = np.asarray(is_asked & (is_on_top | (roughness(new, is_asked) < FOLIAGE_M)))
     if not has_walls:
         return is_smooth
     is_open = _is_seen_through(new.before, surfaces, parent) | _is_seen_through(new.after, surfaces.swapped, parent)
@@ -150,11 +158,73 @@ def came_into_sight(cells: Cells, is_grown: Pair[BoolArray], is_gone: Pair[BoolA
     return found
 
 
+def slopes_from_walls(cells: Cells, surfaces: Pair[Surface], parent: IntArray, is_asked: BoolArray) -> FloatArray:
+    """How steeply the tops of the parts asked for (n,) rise away from the wall of the house that they stand against,
+    m per m; NaN where it cannot be told.
+
+    What is built onto a house sheds its water away from it. A roof that falls towards the wall is that of a thing of
+    its own: a shed put there.
+
+    Parameters
+    ----------
+    cells : Cells
+        Voxels with their owners, the parts among them.
+    surfaces : Pair of Surface
+        Points with their objects, 0 to ``n - 1``.
+    parent : (n,) int32
+        The house of each part.
+    is_asked : (n,) bool
+        Parts that came or went.
+    """
+    n = len(is_asked)
+    slope = np.full(n, np.nan)
+    is_new = cells.voxels.at_points(Pair(cells.is_lost, cells.is_gained), surfaces)
+    new = surfaces.join(is_new, lambda side, own: side.only(own & np.append(is_asked, False)[side.owner]))
+    old = surfaces.join(is_new, lambda side, own: side.only(~own))
+    label = np.concatenate([side.owner for side in new])
+    xyz = np.concatenate([side.xyz for side in new])
+    of_house, house_xyz = np.concatenate([side.owner for side in old]), np.concatenate([side.xyz for side in old])
+    boxes, parts = upright_boxes(xyz, label, n), Groups(label, n)
+    foot = parts.minimum(np.concatenate([side.height for side in new]))
+    for i in np.flatnonzero((foot <= _FOOT_M) & (parts.counts >= _LEAST_BEHIND)).tolist():
+        own = (xyz[parts.members(i)] - boxes.centre[i]) @ boxes.axes[i].T
+        wall = (house_xyz[(of_house == i) | (of_house == parent[i])] - boxes.centre[i]) @ boxes.axes[i].T
+        half = boxes.size[i] / 2
+        is_high = wall[:, 2] > -half[2]
+        sides = []
+        for axis, sign in ((0, -1.0), (0, 1.0), (1, -1.0), (1, 1.0)):
+            depth = sign * wall[:, axis] - half[axis]
+            is_behind = is_high & (np.abs(depth) <= _BEHIND_M / 2) & (np.abs(wall[:, 1 - axis]) <= half[1 - axis])
+            sides.append((np.count_nonzero(is_behind), axis, -sign))
+        most, axis, sign = max(sides)
+        if most >= _LEAST_BEHIND:
+            slope[i] = _slope(sign * own[:, axis], own[:, 2])
+    return slope
+
+
+def _slope(u: FloatArray, z: FloatArray) -> float:
+    """Median slope of the highest points ``z`` (k,) m along ``u`` (k,) m; NaN over less than `_LEAST_DEPTH_M`."""
+    step = np.floor((u - u.min()) / _SAME_M).astype(np.int32)
+    top = Groups(step, int(step.max()) + 1).maximum(z)
+    is_top = top >= np.nanmax(top) - _BEHIND_M
+    place, top = np.flatnonzero(is_top) * _SAME_M, top[is_top]
+    if np.ptp(place) < _LEAST_DEPTH_M:
+        return float("nan")
+    a, b = np.triu_indices(len(place), 1)
+    return float(np.median((top[b] - top[a]) / (place[b] - place[a])))
+
+
 _BESIDE_M = 1.5
 """A wall that came into sight begins no farther from what hid it."""
 
 _MOST_LEVELS = 0.5
 """Share of its levels at which it does."""
+
+_FOOT_M = 0.8
+"""What stands on the ground begins no higher above it."""
+
+_LEAST_DEPTH_M = 1.2
+"""So much of a roof must be seen, from the wall outwards, before it slopes."""
 
 _DEPTH_M = 1.5
 """A wall this far behind what stands before it is looked for."""

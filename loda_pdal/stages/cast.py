@@ -71,22 +71,18 @@ class Cast:
             self.is_extension[each],
         )
 
-    def smooth_only(self, host: IntArray, *, must_show: bool) -> IntArray:
-        """Where the points of each object go, (n + 1,), the last those of none: of the last ``len(host)`` objects, the
-        rough ones that were part of a plant go back to their ``host``, and if ``must_show`` also those of which too
-        little is seen to tell."""
+    def smooth_only(self, host: IntArray) -> IntArray:
+        """Where the points of each object go, (n + 1,), the last those of none: of the last ``len(host)`` objects those
+        that were part of a plant, and do not show that they are smooth, go back to their ``host``."""
         n = len(self) - len(host)
         goes_to = np.append(np.arange(len(self)), -1).astype(np.int32)
         is_asked = np.arange(len(self)) >= n
-        unknown = np.inf if must_show else 0.0
-        is_rough: BoolArray = np.nan_to_num(roughness(self.surfaces, is_asked), nan=unknown) > FOLIAGE_M
+        is_rough = np.nan_to_num(roughness(self.surfaces, is_asked), nan=np.inf) > FOLIAGE_M
         counts = np.bincount(
             np.concatenate([side.owner[side.owner >= 0] for side in self.surfaces]), minlength=len(self)
         )
-        is_few = counts < _LEAST_FOLIAGE
-        is_rough = is_rough | is_few if must_show else is_rough & ~is_few
-        is_rough &= is_asked & (self.object_class == ObjectClass.VEGETATION)
-        goes_to[:-1][is_rough] = host[np.flatnonzero(is_rough) - n]
+        is_back = (is_rough | (counts < _LEAST_FOLIAGE)) & is_asked & (self.object_class == ObjectClass.VEGETATION)
+        goes_to[:-1][is_back] = host[np.flatnonzero(is_back) - n]
         return goes_to
 
     @property

@@ -6,17 +6,18 @@ all. What is unmatched is Added or Removed only if its place was seen, and its s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from loda_pdal.model.boxes import upright_boxes
 from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, IntArray
+from loda_pdal.model.groups import Groups
 from loda_pdal.model.labels import ChangeLabel, ObjectClass
 from loda_pdal.model.lod_grid import LodGrid
 from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams, ConfidenceParams, ObservabilityParams
-from loda_pdal.stages.annexes import are_built_on, came_into_sight, screens
+from loda_pdal.stages.annexes import are_built_on, came_into_sight, screens, slopes_from_walls
 from loda_pdal.stages.cast import FOLIAGE_M, Cast
 from loda_pdal.stages.confidence import calibrated
 from loda_pdal.stages.correspondence import rank_by_place
@@ -33,12 +34,12 @@ from loda_pdal.stages.rules import (
     extension,
     is_no_pair,
     is_within,
+    of_its_own,
     raw_score,
-    screen,
     uncovered,
     verdict_of,
 )
-from loda_pdal.stages.things import carried_on, split_things
+from loda_pdal.stages.things import carried_on, split_close_things, split_things
 from loda_pdal.stages.vehicles import ONE_VEHICLE_M, looks_like_vehicle, roughness, shape_change
 
 
@@ -122,7 +123,8 @@ def decide_changes(
     cast = _divided(surfaces, object_class, voxels, params)
     cells = cast.cells(voxels, params)
     evidence = weigh(cells, cast.surfaces, len(cast), params)
-    cues = cues_of(evidence, cast.object_class, largest_regions(cells, len(cast), params))
+    regions = largest_regions(cells, len(cast), params)
+    cues = cues_of(evidence, cast.object_class, regions)
     is_part = (cast.parent >= 0) & ~cast.is_extension
     verdicts = [
         verdict_of(cue, apart, part, params, observability)
@@ -130,9 +132,12 @@ def decide_changes(
     ]
     has_walls = not params.fills_buildings
     is_building = cast.object_class == ObjectClass.BUILDING
-    is_screen = screens(cells, is_building, cast.is_extension & has_walls)
+    is_asked = cast.is_extension & has_walls
+    is_shed = slopes_from_walls(cells, cast.surfaces, cast.parent, is_asked) > _FALLS
+    is_screen = is_shed | screens(cells, is_building, is_asked)
     for i in np.flatnonzero(cast.is_extension).tolist():
-        verdicts[i] = screen(verdicts[i]) if is_screen[i] else extension(verdicts[i])
+        why = "its roof falls towards the wall behind it" if is_shed[i] else "the wall behind it shows as before"
+        verdicts[i] = of_its_own(verdicts[i], why) if is_screen[i] else extension(verdicts[i])
     if params.needs_sight:
         verdicts = _without_uncovered(verdicts, cells, is_building, evidence.n_voxels)
     raw = np.array(
@@ -142,7 +147,8 @@ def decide_changes(
         ]
     )
     is_of_house = np.append(cast.is_house, False)[cast.parent] & cast.is_extension & ~is_screen
-    is_built_on = are_built_on(cells, cast.surfaces, cast.parent, is_of_house, has_walls=has_walls)
+    is_on_top = (np.fmax(*regions) > 0) & has_walls
+    is_built_on = are_built_on(cells, cast.surfaces, cast.parent, is_of_house, is_on_top, has_walls=has_walls)
     for i, part in changed_houses(verdicts, cast.parent, is_built_on, evidence.dv).items():
         verdicts[i] = Verdict(verdicts[part].label, f"a part of it changed: {verdicts[part].reason}")
         raw[i] = raw[part]
@@ -202,15 +208,29 @@ def _divided(surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, p
         if params.fills_buildings:
             is_asked &= ~_is_line(cast)
         owner, host = split_things(cells, cast.surfaces, is_asked, params)
-        goes_to = cast.with_more(owner, host).smooth_only(host, must_show=params.fills_buildings)
-        owner = owner.map(lambda side: goes_to[side])
+        if params.fills_buildings:
+            goes_to = cast.with_more(owner, host).smooth_only(host)
+            owner = owner.map(lambda side: goes_to[side])
         cast = cast.with_more(owner, host)
+        if params.needs_sight:
+            cast = _with_close_things(cast, voxels, cells, params)
         goes_to = carried_on(cast.surfaces, np.isin(cast.object_class, (ObjectClass.VEGETATION, ObjectClass.OTHER)))
         cast = cast.with_more(cast.surfaces.map(lambda side: goes_to[side.owner]), host[:0]).settled(voxels)
         cells = cast.cells(voxels, params)
     if params.find_parts:
         cast = cast.with_parts(split_parts(cells, cast.surfaces, cast.object_class, params)).settled(voxels)
     return cast
+
+
+def _with_close_things(cast: Cast, voxels: Voxels, cells: Cells, params: ChangeParams) -> Cast:
+    """The objects with small things taken out of them, and out of what only seems to be in the other survey too."""
+    is_vehicle = (cast.object_class == ObjectClass.MOBILE) & looks_like_vehicle(cast.surfaces, len(cast))
+    near = voxels.at_points(cells.is_near.swapped, cast.surfaces)
+    shown = cast.surfaces.join(near, lambda side, is_near: Groups(side.owner, len(cast)).share(is_near))
+    is_asked = np.where(cast.is_pair, ~is_vehicle, ~cast.is_apart & (np.fmax(*shown) >= params.min_support))
+    is_asked &= cast.object_class != ObjectClass.BUILDING
+    more = cast.with_more(*split_close_things(cast.surfaces, is_asked, ~cast.is_pair, params))
+    return replace(more, is_apart=more.is_apart | (np.arange(len(more)) >= len(cast)))
 
 
 def _is_replaced(
@@ -250,6 +270,9 @@ def _stands_aside(cast: Cast, cues: list[Cue], is_asked: BoolArray, params: Chan
     is_off = aside > limit
     return is_off & (roughness(cast.surfaces, is_off) < FOLIAGE_M)
 
+
+_FALLS = 0.1
+"""Slope of a roof, m per m, that is meant: what is level as built is measured within less."""
 
 _LINE_M = 1.5
 """Hedges, fences and walls are narrower, and vehicles, sheds and skips are wider."""

@@ -256,7 +256,7 @@ class Evidence:
         Raw points in the gained or lost voxels, of the epoch that has more of them.
     column_rise, column_scatter : m
         Median change of the top over the columns that both epochs occupy, and what lies between the quartiles of these
-        changes; NaN with fewer than eight of them.
+        changes, more where the columns are few; NaN with fewer than eight of them.
     iou, shift : 3D overlap of the occupancy, and distance of the centroids (m).
     dh : m
         Change of the height that the parameters name.
@@ -347,6 +347,9 @@ def sample_voxels(
         if params.needs_returns:
             covered = covered.join(over, np.logical_and)
         is_open = coverage.swapped.join(xyz, lambda other, points: other.at(points))
+        if params.needs_sight:
+            shaded = _in_shadow(cell, columns, surfaces, params.voxel_m)
+            covered = covered.join(shaded, lambda seen, dark: seen & ~dark)
     return Voxels(
         cell=cell,
         centre=centre,
@@ -412,6 +415,41 @@ def _is_over(
         column = lattice.find(keys, place + (np.array(step) - reach))
         lowest = np.fmin(lowest, Groups(column, len(first)).minimum(xyz[:, 2]))
     return np.asarray(np.repeat(lowest, np.diff(columns)) < centre[:, 2])
+
+
+def _in_shadow(cell: Int64Array, columns: Int64Array, surfaces: Pair[Surface], voxel_m: float) -> Pair[BoolArray]:
+    """Whether each voxel (c,) stands where that epoch shows hardly any of the ground that the other epoch shows.
+
+    What came or went takes ground out of sight, or lets it be seen; where there is less of it without the thing than
+    with it, something nearer to the sensor hid both.
+    """
+    first = columns[:-1]
+    if len(first) == 0:
+        return Pair(np.zeros(len(cell), np.bool_), np.zeros(len(cell), np.bool_))
+    plan = cell[first, :2]
+
+    def ground_about(surface: Surface) -> IntArray:
+        place = cells_of(surface.xyz[~surface.is_surface, :2], voxel_m)
+        lattice = Lattice.around(np.concatenate([plan, place]))
+        keys, counts = np.unique(lattice.keys(place), return_counts=True)
+        counts = np.append(counts, 0)
+        steps = np.ndindex(2 * _GROUND_REACH + 1, 2 * _GROUND_REACH + 1)
+        about = [counts[lattice.find(keys, plan + (np.array(step) - _GROUND_REACH))] for step in steps]
+        return np.asarray(np.sum(about, axis=0), dtype=np.int32)
+
+    shown = surfaces.map(ground_about)
+    dark = shown.join(shown.swapped, lambda own, other: (other >= _LEAST_GROUND) & (own <= _HARDLY_ANY * other))
+    return dark.map(lambda side: np.repeat(side, np.diff(columns)))
+
+
+_GROUND_REACH = 2
+"""Columns on either side of a voxel's in which ground tells whether the place was seen."""
+
+_LEAST_GROUND = 12
+"""Points of ground there, fused, before an epoch that has hardly any must have been kept from seeing it."""
+
+_HARDLY_ANY = 0.1
+"""Share of the other epoch's ground: shadows are dark."""
 
 
 def _is_clear(cell: Int64Array, columns: Int64Array, surface: Surface, voxel_m: float) -> BoolArray:
@@ -707,14 +745,18 @@ def _summit(owner: IntArray, top: FloatArray, n: int) -> FloatArray:
 
 def _rise_of_columns(rises: tuple[IntArray, FloatArray], n: int, least: int) -> tuple[FloatArray, FloatArray]:
     """Median change of the columns' tops (n,) m over the columns that both epochs have, and the distance (n,) m of the
-    quartiles; NaN with fewer than ``least`` columns."""
+    quartiles, wider where the median of few columns is less sure; NaN with fewer than ``least`` columns."""
     groups = Groups(rises[0], n)
     is_told = groups.counts >= least
     scatter = groups.quantile(rises[1], 0.75) - groups.quantile(rises[1], 0.25)
+    scatter *= np.sqrt(np.fmax(_SURE_COLUMNS / np.maximum(groups.counts, 1), 1.0))
     return np.where(is_told, groups.median(rises[1]), np.nan), np.where(is_told, scatter, np.nan)
 
 
 _LEAST_COLUMNS = 8
+
+_SURE_COLUMNS = 25
+"""Columns whose median is as sure as one asks for: the error of a median goes with the root of their number."""
 
 
 def _fair_rises(voxels: Voxels, surfaces: Pair[Surface], n: int) -> tuple[IntArray, FloatArray]:

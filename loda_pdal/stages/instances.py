@@ -5,18 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
 
 from loda_pdal.kernels.clusters import components, count_until, dbscan, linked
 from loda_pdal.kernels.neighbours import nearest
-from loda_pdal.kernels.parallel import run_ranges
-from loda_pdal.kernels.rasters import highest_range
 from loda_pdal.model.boxes import upright_boxes
-from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, Int64Array, IntArray
+from loda_pdal.model.cloud import BoolArray, ByteArray, FloatArray, IntArray
 from loda_pdal.model.grid import Lattice
 from loda_pdal.model.groups import Groups, consecutive, count_cells, favourites
 from loda_pdal.model.labels import ObjectClass
 from loda_pdal.params import InstanceParams, SemanticParams
+from loda_pdal.stages.crowns import Crowns
 from loda_pdal.stages.parked import vehicle_sized
 from loda_pdal.stages.semantics import Semantics, fit_planes, voxel_volume
 
@@ -48,6 +46,7 @@ def form_instances(
     n_raw: IntArray,
     height: FloatArray,
     semantics: Semantics,
+    crowns: Crowns,
     params: InstanceParams,
     rules: SemanticParams,
 ) -> Instances:
@@ -63,6 +62,8 @@ def form_instances(
         Height above ground.
     semantics : Semantics
         Classes and planes of the segments.
+    crowns : Crowns
+        Where touching crowns part.
 
     References
     ----------
@@ -83,7 +84,7 @@ def form_instances(
 
     if params.join_by_footprint:
         _judge_clusters(xyz, height, classification, ~is_vehicle, params, rules)
-    vegetation = _vegetation(xyz, n_raw, height, classification == ObjectClass.VEGETATION, params)
+    vegetation = _vegetation(xyz, n_raw, height, classification == ObjectClass.VEGETATION, crowns, params)
     if rules.vehicle_roughness > 0:  # what was looked for and not found is no vehicle
         mobile = np.where(is_vehicle, semantics.vehicle, -1).astype(np.int32)
     else:
@@ -401,7 +402,12 @@ def _judge(
 
 
 def _vegetation(
-    xyz: FloatArray, n_raw: IntArray, height: FloatArray, is_vegetation: BoolArray, params: InstanceParams
+    xyz: FloatArray,
+    n_raw: IntArray,
+    height: FloatArray,
+    is_vegetation: BoolArray,
+    crowns: Crowns,
+    params: InstanceParams,
 ) -> IntArray:
     """Vegetation instance of each voxel, -1 none: Euclidean clusters, touching crowns split where the preset does."""
     label = np.full(len(xyz), -1, dtype=np.int32)
@@ -418,42 +424,10 @@ def _vegetation(
     else:
         cluster = euclidean_clusters(points, params.cluster_radius_m)
     if params.splits_crowns:
-        cluster = split_crowns(points, height[members], cluster)
+        cluster = crowns.split(points, height[members], cluster)
     label[members] = cluster
     label = _without_small(label, params.vegetation_min_voxels)
     return _without_small(label, params.vegetation_min_points, n_raw)
-
-
-def split_crowns(xyz: FloatArray, height: FloatArray, cluster: IntArray, cell_m: float = 0.5) -> IntArray:
-    """Clusters (m,) split where crowns touch: each point goes to the height maximum uphill of it in plan.
-
-    The canopy height is taken on a ``cell_m`` raster and smoothed over 1 m; each cell climbs from cell to cell
-    to its maximum, and a maximum with a higher place within 1.5 m climbs on, so that close maxima are one crown.
-    """
-    low = np.floor(xyz[:, :2].min(axis=0) / cell_m)
-    margin = int(np.ceil(1.5 / cell_m))
-    ij = (np.floor(xyz[:, :2] / cell_m) - low).astype(np.int64) + margin
-    canopy = np.zeros(tuple(ij.max(axis=0) + margin + 1))
-    np.maximum.at(canopy, (ij[:, 0], ij[:, 1]), np.nan_to_num(height))
-    smooth = ndimage.gaussian_filter(ndimage.maximum_filter(canopy, 3), 0.5 / cell_m)
-    peak = _uphill(smooth, margin).ravel()[_uphill(smooth, 1)][ij[:, 0], ij[:, 1]]
-    top = Groups(cluster, int(cluster.max()) + 1).quantile(height, 0.95)
-    is_tall = np.nan_to_num(top)[cluster] > _CROWN_HEIGHT_M
-    return consecutive(cluster.astype(np.int64) * (smooth.size + 1) + np.where(is_tall, peak + 1, 0))[0]
-
-
-def _uphill(surface: FloatArray, reach: int) -> Int64Array:
-    """Flat index of the maximum that each cell of a raster climbs to, in steps of at most ``reach`` cells."""
-    highest = np.empty(surface.shape, dtype=np.int64)
-    run_ranges(highest_range, len(surface), np.ascontiguousarray(surface), reach, highest, min_size=64)
-    goal = highest.ravel()
-    while not np.array_equal(goal[goal], goal):
-        goal = goal[goal]
-    return goal.reshape(surface.shape)
-
-
-_CROWN_HEIGHT_M = 3.0
-"""Lower vegetation has no crowns to split: a hedge is one object."""
 
 
 def _near_ground_edge(

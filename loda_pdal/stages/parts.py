@@ -113,20 +113,24 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, 
     if params.thing_voxels > 0:  # which looks for what is lower
         is_plant &= np.fmax(*(Groups(side.owner, n).quantile(side.height, 0.95) for side in surfaces)) >= LOW_M
     is_split &= is_pair & ~is_plant
+    is_alone = ~is_pair & (object_class != ObjectClass.MOBILE)  # vehicles stand beside others, and are one body each
     own, clear = cells.owner, cells.voxels.is_clear
     size = params.part_min_voxels, params.part_min_width_m / params.voxel_m
     plant = 1, params.plant_width_m / params.voxel_m
     regions = [
         *connected_regions(cells, own, cells.is_lost, is_split, *size, is_clear=clear.after),
         *connected_regions(cells, own.swapped, cells.is_gained, is_split, *size, is_clear=clear.before),
-        *connected_regions(cells, own, cells.is_near.after, ~is_pair, *size),
-        *connected_regions(cells, own.swapped, cells.is_near.before, ~is_pair, *size),
+        *connected_regions(cells, own, cells.is_near.after, is_alone, *size),
+        *connected_regions(cells, own.swapped, cells.is_near.before, is_alone, *size),
     ]
     if is_plant.any():
         bare = cells.bare_columns
         plants = connected_regions(cells, own, bare.after, is_plant, *plant)
         plants += connected_regions(cells, own.swapped, bare.before, is_plant, *plant)
         regions += [region for region in plants if region.share_new > 0.5]  # not a crown that rose
+    if params.needs_sight and not params.fills_buildings:
+        raised = raised_regions(cells, has_houses & is_split)
+        regions += [region for side in raised for region in side if region.n_voxels < params.part_min_voxels]
     is_of_bodies = params.fills_buildings and bool(has_houses.any())
     roofs = surfaces.map(lambda side: _roof(side, columns_of[0], params.voxel_m)) if is_of_bodies else None
     columns, part, parent, is_house, is_extension = _claim(
@@ -151,21 +155,53 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, 
 
 
 def largest_regions(cells: Cells, n: int, params: ChangeParams) -> Pair[FloatArray]:
-    """Volume (n,) m3 of the largest solid region that each object lost (before) and gained (after); 0 where buildings
-    are not filled, and surfaces have no inside."""
-    if not params.fills_buildings:
-        return Pair(np.zeros(n), np.zeros(n))
+    """Volume (n,) m3 of the largest region that each object lost (before) and gained (after): solid ones of buildings
+    that are filled; else surfaces have no inside, and only what stood on them counts, see `raised_regions`."""
     everyone, width = np.ones(n, np.bool_), params.part_min_width_m / params.voxel_m
+    least, own, clear = params.part_min_voxels, cells.owner, cells.voxels.is_clear
+    regions: Pair[list[Region]] = Pair([], [])
+    if params.fills_buildings:
+        regions = Pair(
+            connected_regions(cells, own, cells.is_lost, everyone, least, width, is_clear=clear.after),
+            connected_regions(cells, own.swapped, cells.is_gained, everyone, least, width, is_clear=clear.before),
+        )
+    elif params.needs_sight:
+        regions = raised_regions(cells, everyone)
 
-    def largest(owner: Pair[IntArray], is_in: BoolArray, is_clear: BoolArray) -> FloatArray:
+    def largest(found: list[Region]) -> FloatArray:
         volume = np.zeros(n)
-        least = params.part_min_voxels
-        for region in connected_regions(cells, owner, is_in, everyone, least, width, is_clear=is_clear):
+        for region in found:
             volume[region.parent] = max(volume[region.parent], region.n_voxels * params.voxel_m**3)
         return volume
 
-    own, clear = cells.owner, cells.voxels.is_clear
-    return Pair(largest(own, cells.is_lost, clear.after), largest(own.swapped, cells.is_gained, clear.before))
+    return regions.map(largest)
+
+
+def raised_regions(cells: Cells, is_asked: BoolArray) -> Pair[list[Region]]:
+    """Pieces that came off and on to what the other epoch shows beneath them of the same object ``is_asked`` (n,).
+
+    A dormer is small beside its house. But the edges of roofs and walls that come and go with the sampling are one
+    column wide, and what is seen through a window stands on nothing that is seen.
+    """
+    own = cells.owner
+
+    def raised(owner: Pair[IntArray], is_in: BoolArray) -> list[Region]:
+        return [
+            region
+            for region in connected_regions(cells, owner, is_in, is_asked, _LEAST_RAISED)
+            if region.share_new <= _OVERHANG
+            and len(region.columns) >= _LEAST_RAISED
+            and _least_side(region.columns) > 1.0
+        ]
+
+    return Pair(raised(own, cells.is_lost), raised(own.swapped, cells.is_gained))
+
+
+_LEAST_RAISED = 5
+"""Columns of a piece that stands on something."""
+
+_OVERHANG = 0.2
+"""Share of its columns that may stand out beyond what it stands on."""
 
 
 def dissolve(owner: Pair[IntArray], is_dissolved: BoolArray, n: int) -> tuple[Pair[IntArray], IntArray]:
@@ -351,8 +387,10 @@ def _claim(
         if np.count_nonzero(is_inside) > most_of * (last - first):
             continue
         is_free = is_inside & (part_of[first:last] < 0)
+        width_m = float((np.ptp(region.columns, axis=0) + 1).max()) * params.voxel_m
+        if has_houses[region.parent] and top is None and width_m <= _LEAST_ANNEX_M:
+            continue
         if is_free.any():
-            width_m = float((np.ptp(region.columns, axis=0) + 1).max()) * params.voxel_m
             is_storey = region.share_new < 0.5 and width_m > _WIDE * params.frontage_m
             is_onto = bool(has_houses[region.parent]) and width_m > _LEAST_ANNEX_M and not is_new and not is_storey
             is_extension.append(is_onto and roofs is None)  # of a body it is known once its house is found

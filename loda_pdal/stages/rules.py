@@ -109,17 +109,18 @@ def verdict_of(
     if not (cue.is_before and cue.is_after):
         alone = _unmatched(cue, is_apart, params, observability)
         return extension(alone) if is_part and _is_piece(cue, params) else alone
-    if observability.is_enabled and cue.observability < observability.min_observability:
+    if cue.object_class == ObjectClass.MOBILE:
+        found = _mobile(cue, params)
+    else:
+        found = (_new_part(cue, params) if is_part else None) or _pair(cue, params)
+    is_same = found.label == ChangeLabel.UNCHANGED and max(cue.support_before, cue.support_after) >= params.min_support
+    if observability.is_enabled and cue.observability < observability.min_observability and not is_same:
         return Verdict(
             ChangeLabel.UNDETERMINED,
             f"both surveys saw only {cue.observability:.0%} of it "
             f"(at least {observability.min_observability:.0%} needed){_hidden(cue)}",
         )
-    if cue.object_class == ObjectClass.MOBILE:
-        return _mobile(cue, params)
-    if is_part and (new := _new_part(cue, params)):
-        return new
-    return _pair(cue, params)
+    return found
 
 
 def _new_part(cue: Cue, params: ChangeParams) -> Verdict | None:
@@ -150,13 +151,13 @@ def extension(verdict: Verdict) -> Verdict:
     return verdict if label is None else Verdict(label, f"a piece of the building: {verdict.reason}")
 
 
-def screen(verdict: Verdict) -> Verdict:
-    """What stands before a house and hides nothing of it is a thing of its own, and the house has not grown."""
+def of_its_own(verdict: Verdict, why: str) -> Verdict:
+    """What stands before a house and is not built onto it came or went itself, and the house has not grown."""
     own = {ChangeLabel.INCREASED: ChangeLabel.ADDED, ChangeLabel.DECREASED: ChangeLabel.REMOVED}
     label = own.get(verdict.label, verdict.label)
     if label not in own.values():
         return verdict
-    return Verdict(label, f"the wall behind it shows as before: {verdict.reason}")
+    return Verdict(label, f"{why}: {verdict.reason}")
 
 
 def uncovered(verdict: Verdict) -> Verdict:
@@ -198,7 +199,8 @@ def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: Ob
             f"the {other} survey could have seen only {cue.observability:.0%} of it "
             f"(at least {observability.min_observability:.0%} needed){_hidden(cue)}",
         )
-    if is_apart:
+    is_undone = cue.object_class in (ObjectClass.BUILDING, ObjectClass.VEGETATION)
+    if is_apart and not (is_undone and support >= params.min_support):
         return Verdict(
             label, f"what the {other} survey shows there is another object; it shares {support:.0%} of the surface"
         )
@@ -259,7 +261,11 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
     if params.fills_buildings and cue.object_class == ObjectClass.BUILDING and abs(cue.column_rise) > abs(dh):
         dh = cue.column_rise  # most of the roof moved, if not its highest part
     has_height = params.use_height and abs(dh) > max(gate, height_m)  # NaN is never above
-    has_volume = params.use_volume and abs(cue.dv_ratio) > ratio
+    dv_ratio = cue.dv_ratio
+    if params.needs_sight and is_green and cue.tall >= LOW_M:  # a crown is as large as the survey says that shows more
+        large = max(cue.volume_before, cue.volume_after)
+        dv_ratio = (cue.gained - cue.lost) * params.voxel_m**3 / large if large > 0 else math.nan
+    has_volume = params.use_volume and abs(dv_ratio) > ratio
     if params.fills_buildings and cue.object_class == ObjectClass.BUILDING:
         # edges of roofs come and go with the sampling: a body changed where a piece of it did, or most of its roof
         has_volume &= max(cue.grown_m3, cue.cut_m3) > 0
@@ -283,8 +289,8 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
         rises, sinks = rises or rose, sinks or fell
     noise = params.volume_sigmas * math.sqrt(cue.gained + cue.lost)
     has_volume = has_volume and abs(cue.gained - cue.lost) >= noise
-    swells = has_volume and cue.dv_ratio > 0 and (least == 0 or cue.gained >= max(least, cue.lost))
-    shrinks = has_volume and cue.dv_ratio < 0 and (least == 0 or cue.lost >= max(least, cue.gained))
+    swells = has_volume and dv_ratio > 0 and (least == 0 or cue.gained >= max(least, cue.lost))
+    shrinks = has_volume and dv_ratio < 0 and (least == 0 or cue.lost >= max(least, cue.gained))
     figures = _figures(cue, dh, height_m, ratio, gate)
     if by_columns:
         figures = f"columns {cue.column_rise:+.2f} m in the median (limit {least_rise:.2f} m), {figures}"

@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import numpy as np
 
+from loda_pdal.kernels.clusters import linked
 from loda_pdal.kernels.neighbours import nearest
 from loda_pdal.model.boxes import upright_boxes
 from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array, IntArray
 from loda_pdal.model.grid import Lattice, cells_of
-from loda_pdal.model.groups import Groups
+from loda_pdal.model.groups import Groups, favourites
 from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams
 from loda_pdal.stages.cast import FOLIAGE_M
 from loda_pdal.stages.cues import Cells, Surface, Voxels
 from loda_pdal.stages.parts import Region, connected_regions
+from loda_pdal.stages.rules import LOW_M
 from loda_pdal.stages.vehicles import roughness
 
 _LEAST_NEW = 0.7
@@ -103,6 +105,93 @@ def _given(surface: Surface, things: list[Region], first: int, voxel_m: float) -
     keys, number = keys[order][is_first], number[order][is_first]
     found = lattice.find(keys, np.column_stack([surface.owner.astype(np.int64), cells_of(surface.xyz[:, :2], voxel_m)]))
     return np.where(found >= 0, number[np.maximum(found, 0)], surface.owner).astype(np.int32)
+
+
+def split_close_things(
+    surfaces: Pair[Surface], is_asked: BoolArray, is_single: BoolArray, params: ChangeParams
+) -> tuple[Pair[IntArray], IntArray]:
+    """Small things that stand nearer to what they are merged with than the occupancy tells apart.
+
+    A bicycle against a bench, a bollard by a hedge: the bench is within reach of all of the bicycle. But nothing stands
+    where its points are, to the width of a fused point, and the ground that it stands on shows in the other survey.
+
+    Parameters
+    ----------
+    surfaces : Pair of Surface
+        Points with their objects, 0 to ``n - 1``.
+    is_asked : (n,) bool
+        Objects that are looked through.
+    is_single : (n,) bool
+        Objects of one epoch: what touches one of them is the rest of it.
+
+    Returns
+    -------
+    owner, host
+        As of `split_things`.
+    """
+    n = len(is_asked)
+    before, host_before = _close_things(surfaces, is_asked, is_single, n, params)
+    after, host_after = _close_things(surfaces.swapped, is_asked, is_single, n + len(host_before), params)
+    return Pair(before, after), np.concatenate([host_before, host_after])
+
+
+def _close_things(
+    surfaces: Pair[Surface], is_asked: BoolArray, is_single: BoolArray, first: int, params: ChangeParams
+) -> tuple[IntArray, IntArray]:
+    """Owners (m,) of this epoch's points with its small things, numbered from ``first``, and the host (t,) of each;
+    ``surfaces`` of this epoch and of the other."""
+    own, other = surfaces
+    member = np.flatnonzero(np.append(is_asked, False)[own.owner])
+    found, _ = nearest(other.xyz[other.is_surface], own.xyz[member], _POINT_M)
+    alone = member[found < 0]
+    if len(alone) == 0:
+        return own.owner, np.zeros(0, dtype=np.int32)
+    linked_ones = np.column_stack([linked(own.xyz[alone], _CONTACT_M), own.owner[alone]])
+    pieces, cluster = np.unique(linked_ones, axis=0, return_inverse=True)
+    cluster, k = cluster.ravel(), len(pieces)
+    beneath, _ = nearest(other.xyz[~other.is_surface] * _FLAT, own.xyz[alone] * _FLAT, _POINT_M)
+    groups = Groups(cluster, k)
+    low, high = groups.extremes(own.height[alone])
+    # what ends just beneath what still stands carries it: the pole of a sign, of which the other survey met the plate
+    top = np.flatnonzero(own.height[alone] >= high[cluster])
+    over, _ = nearest(other.xyz[other.is_surface], own.xyz[alone[top]] + [0.0, 0.0, _POINT_M], _POINT_M)
+    carries = Groups(cluster[top], k).share(over >= 0) > 0
+    is_thing = (groups.counts >= _LEAST_POINTS) & (groups.sum(own.n_raw[alone]) >= params.min_returns)
+    is_thing &= (low <= _LOW_FOOT_M) & (high > params.raised_m) & (high <= LOW_M)
+    is_thing &= (groups.share(beneath >= 0) >= _LEAST_NEW) & ~carries
+    whole = _whole(own, alone, cluster, pieces[:, 1], is_single)
+    is_new = is_thing & (whole < 0)
+    whole[is_new] = first + np.arange(np.count_nonzero(is_new), dtype=np.int32)
+    owner = own.owner.copy()
+    owner[alone] = np.where(is_thing[cluster], whole[cluster], owner[alone])
+    return owner, pieces[is_new, 1].astype(np.int32)
+
+
+def _whole(side: Surface, piece: Int64Array, label: Int64Array, host: IntArray, is_single: BoolArray) -> IntArray:
+    """Object (k,) of one epoch that the points ``piece`` (p,) with a ``label`` (p,) touch most, but for the ``host``
+    (k,) of each label; -1 where there is none."""
+    found = np.full(len(host), -1, dtype=np.int32)
+    single = np.flatnonzero(np.append(is_single, False)[side.owner])
+    if len(single):
+        beside, _ = nearest(side.xyz[single], side.xyz[piece], _CONTACT_M)
+        theirs = side.owner[single[beside]]
+        is_other = (beside >= 0) & (theirs != host[label])
+        own, other, _ = favourites(label[is_other], theirs[is_other])
+        found[own] = other
+    return found
+
+
+_POINT_M = 0.38
+"""Points of one surface lie no farther apart, fused to 0.25 m: the diagonal of a square of that, and the noise."""
+
+_FLAT = np.array([1.0, 1.0, 0.0])
+"""Points times this lie in plan."""
+
+_LEAST_POINTS = 8
+"""Fused points of a thing."""
+
+_LOW_FOOT_M = 0.6
+"""Its lowest point lies no higher: hardly any ray reaches the ground right beside a neighbour."""
 
 
 def carried_on(surfaces: Pair[Surface], is_asked: BoolArray) -> IntArray:

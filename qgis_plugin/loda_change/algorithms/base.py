@@ -138,12 +138,13 @@ class LodaAlgorithm(QgsProcessingAlgorithm):
 
     def _add_choices(self):
         definitions = settings.engine_definitions()
+        presets = definitions.get("preset_names", list(definitions["presets"]))
         self._add(
             QgsProcessingParameterEnum(
                 "PRESET",
                 "Preset",
-                definitions.get("preset_names", list(definitions["presets"])),
-                defaultValue=definitions["name"],
+                presets,
+                defaultValue="auto" if "auto" in presets else definitions["name"],
                 usesStaticStrings=True,
             ),
             "Where all parameters start from: street (vehicle LiDAR), aerial (airborne LiDAR), paper (the published "
