@@ -388,7 +388,7 @@ def _claim(
             continue
         is_free = is_inside & (part_of[first:last] < 0)
         width_m = float((np.ptp(region.columns, axis=0) + 1).max()) * params.voxel_m
-        if has_houses[region.parent] and top is None and width_m <= _LEAST_ANNEX_M:
+        if has_houses[region.parent] and roofs is None and width_m <= _LEAST_ANNEX_M:
             continue
         if is_free.any():
             is_storey = region.share_new < 0.5 and width_m > _WIDE * params.frontage_m
