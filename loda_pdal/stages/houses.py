@@ -51,7 +51,7 @@ _GAP = 2
 _NARROWER = 0.6
 """No house is narrower than this many frontages: what looks like a party wall in it is a dormer or a chimney."""
 
-_WIDER = 4.0
+_WIDER = 2.0
 """What is wider than this many frontages and shows no party wall is several houses of one height."""
 
 _NEXT = 2
