@@ -641,13 +641,13 @@ class ConfidenceParams(StageParams):
     weight_shift: float = param(0.10, "weight of the centroid shift", low=0, high=1)
     weight_displacement: float = param(0.15, "weight of the normal displacement", low=0, high=1)
     calibration_unmatched: tuple[float, ...] = param(
-        (-0.3, 3.28), "logistic offset and slope of Added and Removed", low=-50, high=50
+        (-0.21, 3.15), "logistic offset and slope of Added and Removed", low=-50, high=50
     )
     calibration_changed: tuple[float, ...] = param(
-        (1.16, 0.74), "logistic offset and slope of Increased and Decreased", low=-50, high=50
+        (1.75, 0.84), "logistic offset and slope of Increased and Decreased", low=-50, high=50
     )
     calibration_unchanged: tuple[float, ...] = param(
-        (-3.04, 5.32), "logistic offset and slope of Unchanged", low=-50, high=50
+        (-2.64, 4.86), "logistic offset and slope of Unchanged", low=-50, high=50
     )
 
 
@@ -907,9 +907,9 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
         },
         "observability": {"cell_m": 2.0},
         "confidence": {
-            "calibration_unmatched": (0.11, 2.45),
-            "calibration_changed": (1.42, 0.0),
-            "calibration_unchanged": (-2.31, 5.63),
+            "calibration_unmatched": (-1.07, 3.75),
+            "calibration_changed": (1.58, 0.0),
+            "calibration_unchanged": (-2.37, 5.73),
         },
     },
     "paper": {
