@@ -129,7 +129,7 @@ def run_chain(surveys: Path, pipelines_dir: Path, tmp_path_factory: pytest.TempP
                 "stage.before.filename": str(surveys / "before.laz"),
                 "stage.after.filename": str(surveys / "after.laz"),
                 "stage.output.filename": str(folder / "out.laz"),
-                "filters.python.pdalargs": json.dumps({"run": str(run_folder)}),
+                "filters.python.pdalargs": json.dumps({"run": str(run_folder), "preset": "street"}),
             }
             made = run_pipeline(pipelines_dir / f"{name}.json", overrides, engine=engine)
             assert made.engine == engine
@@ -241,7 +241,7 @@ def test_any_order_and_the_folder_of_an_earlier_chain(
     engine: str, surveys: Path, tmp_path: Path, detected: ChangeResult
 ) -> None:
     """lod before ground, what is missing made on the way, and a second pipeline that finds it all done."""
-    arguments = {"run": str(tmp_path / "run")}
+    arguments = {"run": str(tmp_path / "run"), "preset": "street"}
     path = small_pipeline(surveys, tmp_path, [builder.python_stage(name, arguments) for name in ("lod", "ground")])
     run_pipeline(path, engine=engine)
     points = laspy.read(tmp_path / "out.las")
@@ -276,7 +276,7 @@ def test_results_of_other_points_or_parameters_are_not_used(surveys: Path, tmp_p
 
 
 def test_without_a_run_folder_nothing_is_kept(surveys: Path, tmp_path: Path, detected: ChangeResult) -> None:
-    path = small_pipeline(surveys, tmp_path, [builder.python_stage("lod")])
+    path = small_pipeline(surveys, tmp_path, [builder.python_stage("lod", {"preset": "street"})])
     run_pipeline(path, engine="embedded")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out.las", "own.json"]
     points = laspy.read(tmp_path / "out.las")
