@@ -711,6 +711,13 @@ class Parameters:
         start = base or cls.preset(str(named) if named in PRESETS else otherwise)
         return start.with_values(values, where=str(path))
 
+    @classmethod
+    def chosen(cls, preset: str | None, path: Path | None, suits: str = "street") -> Parameters:
+        """The ``preset`` under what the file at ``path`` sets, if any; where neither names one, or ``auto``,
+        ``suits`` stands in: the preset that the surveys look like."""
+        base = None if preset in (None, AUTO) else cls.preset(preset)
+        return cls.load(path, base, suits) if path else base or cls.preset(suits)
+
     def with_values(self, values: Mapping[str, Any], where: str = "parameters") -> Parameters:
         """A copy with ``{stage: {key: value}}`` set; unknown stages and keys are errors."""
         stages: dict[str, Any] = {}

@@ -232,11 +232,14 @@ def segment_instances(
     clouds: Pair[VoxelCloud], ground: Pair[Ground], classes: Pair[Semantics], p: Parameters
 ) -> Pair[Instances]:
     """Instances within each class (section 4.2); touching crowns part in both where one epoch shows it."""
-    is_plant = classes.map(lambda side: side.classification == ObjectClass.VEGETATION)
-    plants = clouds.join(is_plant, lambda cloud, asked: cloud.xyz[asked])
-    crowns = find_crowns(plants, ground.join(is_plant, lambda g, asked: g.height[asked]))
+    crowns: Pair[Crowns | None] = Pair(None, None)
+    if p.instances.splits_crowns:
+        is_plant = classes.map(lambda side: side.classification == ObjectClass.VEGETATION)
+        plants = clouds.join(is_plant, lambda cloud, asked: cloud.xyz[asked])
+        found = find_crowns(plants, ground.join(is_plant, lambda g, asked: g.height[asked]))
+        crowns = Pair(found.before, found.after)
 
-    def of_epoch(cloud: VoxelCloud, g: Ground, semantics: Semantics, own: Crowns) -> Instances:
+    def of_epoch(cloud: VoxelCloud, g: Ground, semantics: Semantics, own: Crowns | None) -> Instances:
         return form_instances(cloud.xyz, cloud.n_raw, g.height, semantics, own, p.instances, p.semantics)
 
     return at_once(of_epoch, clouds, ground, classes, crowns)

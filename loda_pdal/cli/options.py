@@ -71,8 +71,7 @@ def chosen_parameters(
 
     ``suits`` names the preset that the surveys look like: it stands in where no option chooses one.
     """
-    base = None if preset in (None, AUTO) else Parameters.preset(preset)
-    chosen = Parameters.load(params_file, base, suits) if params_file else base or Parameters.preset(suits)
+    chosen = Parameters.chosen(preset, params_file, suits)
     for setting in settings:
         chosen = chosen.with_setting(setting)
     return chosen

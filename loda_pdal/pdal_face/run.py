@@ -107,11 +107,8 @@ class Arguments:
 
 def _chosen(given: Mapping[str, Any], suits: str = "street") -> Parameters:
     """Parameters as ``preset``, ``params`` and ``set`` choose them, ``suits`` where neither names a preset."""
-    preset = given.get("preset", AUTO)
-    base = None if preset == AUTO else Parameters.preset(str(preset))
-    parameters = base or Parameters.preset(suits)
-    if given.get("params"):
-        parameters = Parameters.load(Path(str(given["params"])), base, suits)
+    path = Path(str(given["params"])) if given.get("params") else None
+    parameters = Parameters.chosen(str(given.get("preset", AUTO)), path, suits)
     settings = given.get("set", {})
     if not isinstance(settings, Mapping):
         raise ParameterError("pdalargs: set is no table.", 'Write "set": {"lod.radius_m": 1.5}.', "pdalargs-invalid")

@@ -54,13 +54,23 @@ def are_built_on(
     has_walls : bool
         Whether the surveys show walls: from the air there are hardly any to see through what stands before them.
     """
-    came_or_went = cells.voxels.at_points(Pair(cells.is_lost, cells.is_gained), surfaces)
-    new = surfaces.join(came_or_went, lambda side, is_new: side.only(is_new & np.append(is_asked, False)[side.owner]))
+    new = _new_of(surfaces, _came_or_went(cells, surfaces), is_asked)
     is_smooth = np.asarray(is_asked & (is_on_top | (roughness(new, is_asked) < FOLIAGE_M)))
     if not has_walls:
         return is_smooth
     is_open = _is_seen_through(new.before, surfaces, parent) | _is_seen_through(new.after, surfaces.swapped, parent)
     return np.asarray(is_smooth & ~is_open)
+
+
+def _came_or_went(cells: Cells, surfaces: Pair[Surface]) -> Pair[BoolArray]:
+    """Which points of each epoch the other one does not have."""
+    return cells.voxels.at_points(Pair(cells.is_lost, cells.is_gained), surfaces)
+
+
+def _new_of(surfaces: Pair[Surface], is_new: Pair[BoolArray], is_asked: BoolArray) -> Pair[Surface]:
+    """Those of the points that came or went that belong to objects ``is_asked`` (n,)."""
+    asked = np.append(is_asked, False)
+    return surfaces.join(is_new, lambda side, own: side.only(own & asked[side.owner]))
 
 
 def _is_seen_through(new: Surface, surfaces: Pair[Surface], parent: IntArray) -> BoolArray:
@@ -178,8 +188,10 @@ def slopes_from_walls(cells: Cells, surfaces: Pair[Surface], parent: IntArray, i
     """
     n = len(is_asked)
     slope = np.full(n, np.nan)
-    is_new = cells.voxels.at_points(Pair(cells.is_lost, cells.is_gained), surfaces)
-    new = surfaces.join(is_new, lambda side, own: side.only(own & np.append(is_asked, False)[side.owner]))
+    if not is_asked.any():
+        return slope
+    is_new = _came_or_went(cells, surfaces)
+    new = _new_of(surfaces, is_new, is_asked)
     old = surfaces.join(is_new, lambda side, own: side.only(~own))
     label = np.concatenate([side.owner for side in new])
     xyz = np.concatenate([side.xyz for side in new])

@@ -46,7 +46,7 @@ def form_instances(
     n_raw: IntArray,
     height: FloatArray,
     semantics: Semantics,
-    crowns: Crowns,
+    crowns: Crowns | None,
     params: InstanceParams,
     rules: SemanticParams,
 ) -> Instances:
@@ -62,8 +62,8 @@ def form_instances(
         Height above ground.
     semantics : Semantics
         Classes and planes of the segments.
-    crowns : Crowns
-        Where touching crowns part.
+    crowns : Crowns or None
+        Where touching crowns part; None where they stay together.
 
     References
     ----------
@@ -406,7 +406,7 @@ def _vegetation(
     n_raw: IntArray,
     height: FloatArray,
     is_vegetation: BoolArray,
-    crowns: Crowns,
+    crowns: Crowns | None,
     params: InstanceParams,
 ) -> IntArray:
     """Vegetation instance of each voxel, -1 none: Euclidean clusters, touching crowns split where the preset does."""
@@ -423,7 +423,7 @@ def _vegetation(
         cluster = euclidean_clusters(points, params.cluster_radius_m, reach)
     else:
         cluster = euclidean_clusters(points, params.cluster_radius_m)
-    if params.splits_crowns:
+    if crowns is not None:
         cluster = crowns.split(points, height[members], cluster)
     label[members] = cluster
     label = _without_small(label, params.vegetation_min_voxels)

@@ -248,6 +248,14 @@ def _mobile(cue: Cue, params: ChangeParams) -> Verdict:
     return Verdict(label, f"not the same object; the {other} survey shows more of its own: {figures}")
 
 
+def _volume_ratio(cue: Cue, params: ChangeParams) -> float:
+    """Relative change of volume; NaN where it is not known. A crown is as large as the survey says that shows more."""
+    if not (params.needs_sight and cue.object_class == ObjectClass.VEGETATION and cue.tall >= LOW_M):
+        return cue.dv_ratio
+    large = max(cue.volume_before, cue.volume_after)
+    return (cue.gained - cue.lost) * params.voxel_m**3 / large if large > 0 else math.nan
+
+
 def _pair(cue: Cue, params: ChangeParams) -> Verdict:
     """Matched buildings, vegetation and other objects (paper, section 4.3)."""
     is_green = cue.object_class == ObjectClass.VEGETATION
@@ -261,10 +269,7 @@ def _pair(cue: Cue, params: ChangeParams) -> Verdict:
     if params.fills_buildings and cue.object_class == ObjectClass.BUILDING and abs(cue.column_rise) > abs(dh):
         dh = cue.column_rise  # most of the roof moved, if not its highest part
     has_height = params.use_height and abs(dh) > max(gate, height_m)  # NaN is never above
-    dv_ratio = cue.dv_ratio
-    if params.needs_sight and is_green and cue.tall >= LOW_M:  # a crown is as large as the survey says that shows more
-        large = max(cue.volume_before, cue.volume_after)
-        dv_ratio = (cue.gained - cue.lost) * params.voxel_m**3 / large if large > 0 else math.nan
+    dv_ratio = _volume_ratio(cue, params)
     has_volume = params.use_volume and abs(dv_ratio) > ratio
     if params.fills_buildings and cue.object_class == ObjectClass.BUILDING:
         # edges of roofs come and go with the sampling: a body changed where a piece of it did, or most of its roof
