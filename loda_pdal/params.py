@@ -189,6 +189,9 @@ class GroundParams(StageParams):
     """Ground model and common vertical axis (paper, section 4.1)."""
 
     cell_m: float = param(2.0, "edge of a ground cell", unit="m", low=0.5, high=50, is_length=True)
+    detail_m: float = param(
+        2.0, "where ground cells grew with the spacing, cells of the detail between planes", unit="m", low=0.5, high=50
+    )
     inlier_m: float = param(0.10, "RANSAC inlier distance", unit="m", low=0.01, high=2)
     min_inliers: int = param(
         200,

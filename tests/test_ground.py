@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import laspy
@@ -191,6 +192,40 @@ def test_sparse_cells_need_fewer_raw_points() -> None:
     assert _model(points, n_raw=1).is_plane.mean() > 0.95  # 16 raw points a cell, far below 200
 
 
+def test_sparse_surveys_keep_what_the_terrain_does_within_a_plane() -> None:
+    rng = np.random.default_rng(12)
+    xy = rng.uniform(0.0, 240.0, (9000, 2))  # a return each 2.5 m
+
+    def hills(at: np.ndarray) -> np.ndarray:
+        return np.asarray(1.5 * np.sin(at[:, 0] / 5.0) + 1.0 * np.cos(at[:, 1] / 6.0))
+
+    plants = rng.random(len(xy)) < 0.1
+    points = np.column_stack([xy, hills(xy) + rng.normal(0, 0.02, len(xy)) + plants * rng.uniform(0.2, 3.0, len(xy))])
+    params = Parameters.preset("aerial").for_spacing(2.0)
+    truth_at = rng.uniform(20.0, 220.0, (5000, 2))
+
+    def off(detail_m: float) -> np.ndarray:
+        ground = replace(params.ground, detail_m=detail_m)
+        found = ground_model(points, np.ones(len(points), np.int32), ground)
+        assert found.has_ground
+        return found.height_at(truth_at) - hills(truth_at)
+
+    coarse, fine = off(50.0), off(2.0)
+    assert params.ground.cell_m == 8.0
+    assert np.median(np.abs(coarse)) > 0.13  # what a plane of 8 m cuts off
+    assert np.median(np.abs(fine)) < 0.06
+    assert abs(np.median(fine)) < 0.02  # plants do not lift it
+
+
+def test_dense_surveys_have_the_planes_of_the_paper() -> None:
+    points = to_local_grid(_ground_points(np.random.default_rng(9), 0.0, 20.0))
+    ones = np.full(len(points), 5, np.int32)
+    for detail_m in (2.0, 50.0):
+        np.testing.assert_array_equal(
+            ground_model(points, ones, replace(PARAMS, detail_m=detail_m)).height, _model(points).height
+        )
+
+
 def test_empty_and_tiny_clouds() -> None:
     empty = _model(np.zeros((0, 3)))
     assert not empty.has_ground
@@ -238,25 +273,26 @@ def _height(xyz: np.ndarray, preset: str, spacing_m: float) -> tuple[np.ndarray,
 
 @pytest.mark.data
 @pytest.mark.parametrize(
-    ("file", "spacing_m", "f1"),
+    ("file", "spacing_m", "f1", "roofs"),
     [
-        ("ahn_tiles/3dfier_ahn3_cropped_1.laz", 0.26, 0.97),
-        ("ahn_tiles/3dfier_ahn3_cropped_2.laz", 0.28, 0.97),
-        ("ahn_tiles/ams_ahn4_2496_9727.laz", 0.15, 0.96),
-        ("ahn_tiles/ams_ahn_2397_9705.laz", 0.28, 0.98),
-        ("ahn_tiles/ams_ahn_2463_9714.laz", 0.19, 0.93),
-        ("ign_lidarhd/ctview_classee_77050_627755.las", 0.34, 0.97),
-        ("ign_lidarhd/semis_2021_0382_6565_cropped.laz", 1.84, 0.95),
+        ("ahn_tiles/3dfier_ahn3_cropped_1.laz", 0.26, 0.97, 0.01),
+        ("ahn_tiles/3dfier_ahn3_cropped_2.laz", 0.28, 0.97, 0.01),
+        ("ahn_tiles/ams_ahn4_2496_9727.laz", 0.15, 0.96, 0.01),
+        ("ahn_tiles/ams_ahn_2397_9705.laz", 0.28, 0.98, 0.01),
+        ("ahn_tiles/ams_ahn_2463_9714.laz", 0.19, 0.93, 0.01),
+        ("ign_lidarhd/ctview_classee_77050_627755.las", 0.34, 0.97, 0.01),
+        ("ign_lidarhd/semis_2021_0382_6565_cropped.laz", 1.84, 0.97, 0.01),
+        ("ign_lidarhd/semis_2023_0292_6833.laz", 1.84, 0.94, 0.05),
     ],
 )
-def test_airborne_labels_agree(data_dir: Path, file: str, spacing_m: float, f1: float) -> None:
+def test_airborne_labels_agree(data_dir: Path, file: str, spacing_m: float, f1: float, roofs: float) -> None:
     xyz, label = _labelled(data_dir / file)
     height, model = _height(xyz, "aerial", spacing_m)
     is_judged = ~np.isin(label, (9, 17, 26))  # water and bridges: either answer is right
     is_ground, is_found = (label == 2)[is_judged], (np.abs(height) < 0.2)[is_judged]
     assert model.has_ground
     assert 2 * (is_ground & is_found).sum() / (is_ground.sum() + is_found.sum()) > f1
-    assert np.count_nonzero(np.abs(height[label == 6]) < 0.2) <= 0.01 * np.count_nonzero(label == 6)
+    assert np.count_nonzero(np.abs(height[label == 6]) < 0.2) <= roofs * np.count_nonzero(label == 6)
 
 
 @pytest.mark.data
