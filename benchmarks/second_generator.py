@@ -278,10 +278,8 @@ Caster = Callable[[FloatArray], tuple[FloatArray, IntArray]]
 """Distance (m) and thing (0 ground, else its number; -1 for what is not annotated) of rays (r, 6); inf for none."""
 
 
-def open3d_caster(block: Block, epoch: int, origin: FloatArray) -> Caster:
-    """Rays into what one survey meets, by Open3D (float32: everything is relative to ``origin``)."""
-    import open3d
-
+def surfaces(block: Block, epoch: int) -> tuple[FloatArray, IntArray]:
+    """Triangles (t, 3, 3) that one survey may meet, and whose they are (t,), numbered as in `Caster`."""
     grid = np.arange(-2 * HALF_M, 2 * HALF_M + 1.0, 3.0)
     x, y = np.meshgrid(block.centre[0] + grid, block.centre[1] + grid, indexing="ij")
     g = np.stack([x, y, block.ground(x, y)], axis=-1)
@@ -290,8 +288,16 @@ def open3d_caster(block: Block, epoch: int, origin: FloatArray) -> Caster:
     shapes = ([*thing.shapes][epoch] for thing in block.things)
     parts += [(shape, number) for number, shape in enumerate(shapes, 1) if shape is not None]
     parts += [(shape, -1) for shape in block.surroundings]
-    owner = np.concatenate([np.full(len(shape), number) for shape, number in parts])
-    vertices = (np.concatenate([shape for shape, _ in parts]).reshape(-1, 3) - origin).astype(np.float32)
+    owner = np.concatenate([np.full(len(shape), number, np.int32) for shape, number in parts])
+    return np.concatenate([shape for shape, _ in parts]), owner
+
+
+def open3d_caster(block: Block, epoch: int, origin: FloatArray) -> Caster:
+    """Rays into what one survey meets, by Open3D (float32: everything is relative to ``origin``)."""
+    import open3d
+
+    corners, owner = surfaces(block, epoch)
+    vertices = (corners.reshape(-1, 3) - origin).astype(np.float32)
     scene = open3d.t.geometry.RaycastingScene()
     triangles = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
     scene.add_triangles(open3d.core.Tensor(vertices), open3d.core.Tensor(triangles))
