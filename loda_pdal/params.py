@@ -867,7 +867,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
         "name": "aerial",
         "adapts_to_spacing": True,
         "fuse": {"leaf_m": 0.5},
-        "outliers": {"keep_voxels": 0},
+        "outliers": {"keep_voxels": 5, "keep_gap_m": 2.0},
         "normals": {"radius_m": 1.5},
         "icp": {"leaves_m": (2.0, 1.0, 0.5), "radii_m": (3.0, 1.5, 0.75)},
         "ground": {"max_object_m": 60.0, "min_voxels": 4},

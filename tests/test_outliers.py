@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from loda_pdal.model.cloud import VoxelCloud
-from loda_pdal.params import OutlierParams
+from loda_pdal.params import OutlierParams, Parameters
 from loda_pdal.stages.outliers import find_outliers, remove_outliers
 
 
@@ -54,3 +56,20 @@ def test_nothing_is_removed_where_nothing_stands_out() -> None:
     for n in range(5):
         assert find_outliers(square[:n], OutlierParams(k=20)).tolist() == [False] * n
     assert not find_outliers(np.zeros((7, 3)), OutlierParams()).any()
+
+
+def test_a_crown_over_dense_ground_is_no_noise_from_the_air() -> None:
+    rng = np.random.default_rng(3)
+    axis = np.arange(0.0, 40.0, 0.5)
+    ground = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+    ground = np.column_stack([ground, np.zeros(len(ground))])
+    direction = rng.normal(size=(25, 3))
+    crown = [20.0, 20.0, 8.0] + 3.0 * direction / np.linalg.norm(direction, axis=1)[:, None]
+    birds = np.array([[5.0, 5.0, 30.0], [30.0, 10.0, 45.0], [30.5, 10.0, 45.0]])
+    xyz = np.concatenate([ground, crown, birds])
+    params = Parameters.preset("aerial").outliers
+    assert find_outliers(xyz, replace(params, keep_voxels=0))[len(ground) : -3].sum() > 20
+    is_outlier = find_outliers(xyz, params)
+    assert not is_outlier[: len(ground)].any()
+    assert is_outlier[len(ground) : -3].sum() <= 5
+    assert is_outlier[-3:].all()
