@@ -86,7 +86,7 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, 
     against a shed, the two are one new object: the region that the other epoch shows too becomes a part.
 
     Other objects shorter than ``part_of_length_m`` that both epochs have stay whole, and so does an object of which a
-    region takes most columns, unless that is a new house.
+    region takes most columns, unless that is a new house, or leaves as much of a body as a house has.
 
     A building up to that length is one house, or two of which one came or went. What changed of a longer one is part
     of a house in a row: ``frontage_m`` of the row about it are taken out too, as the house that it is a part of.
@@ -390,7 +390,7 @@ def _under(region: Int64Array, columns: Int64Array, *, fills_hull: bool) -> Bool
 
 
 def _has_house(columns: Int64Array, params: ChangeParams) -> bool:
-    """Whether a connected piece of the columns (k, 2) is as large as a house, and as wide as a part."""
+    """Whether a connected piece of the columns (k, 2) is as large as the least house, and as wide."""
     least = (_WIDE * params.frontage_m / params.voxel_m) ** 2
     if len(columns) < least:
         return False

@@ -20,7 +20,7 @@ from loda_pdal.stages.parked import parked_vehicles
 _LINEARITY, _PLANARITY, _SPHERICITY, _VERTICAL, _HEIGHT = range(5)
 
 _FLAT = 0.05
-"""Largest median sphericity of a roof; that of crowns is 0.15 and more."""
+"""Largest median sphericity of a roof; plants begin far above it."""
 
 _LEVEL = 0.7
 """Smallest |n.z| of the plane through a roof of several levels."""
