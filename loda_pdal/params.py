@@ -320,6 +320,14 @@ class SemanticParams(StageParams):
     has_roofs: bool = param(True, "elevated planar patches are building too (METHOD 1.8)")
     roof_height_m: float = param(2.0, "lowest median height of a roof", unit="m", low=0.5, high=20)
     roof_area_m2: float = param(6.0, "smallest support of a roof", unit="m2", low=0.1, high=1000)
+    stepped_roof_m2: float = param(
+        0.0,
+        "smallest area of a roof that is flat all over but lies in no one plane, as those of a row that step a little "
+        "from house to house; 0: there is none",
+        unit="m2",
+        low=0,
+        high=10000,
+    )
     building_top_m: float = param(
         2.2,
         "a building reaches at least this high; lower planes are walls or vehicles",
@@ -875,7 +883,12 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
         "features": {"radius_m": 1.25},
         "superpoints": {"max_edge_m": 2.0},
         "proxies": {"voxel_m": 1.0, "min_voxels": 50},
-        "semantics": {"building_rmse_m": 0.15, "vegetation_sphericity": 0.15, "vehicle_roughness": 0.0},
+        "semantics": {
+            "building_rmse_m": 0.15,
+            "stepped_roof_m2": 25.0,
+            "vegetation_sphericity": 0.15,
+            "vehicle_roughness": 0.0,
+        },
         "instances": {
             "building_gap_m": 1.2,
             "roof_step_m": 1.0,

@@ -93,6 +93,31 @@ def test_a_storey_on_one_house_of_a_row_is_a_part_of_it() -> None:
     assert changes.parent[part] == 1 - part
 
 
+def test_a_house_that_went_and_a_storey_taken_beside_it_are_two_changes() -> None:
+    row = roof((0, 30), (0, 9), 7.0)
+    x = row[:, 0]
+    left = row.copy()
+    left[(x > 14) & (x < 20), 2] -= 2.5
+    left = left[(x < 8) | (x > 14)]
+    for before, after, gone, lower in ((row, left, "REMOVED", "DECREASED"), (left, row, "ADDED", "INCREASED")):
+        changes = decide([(0, before)], [(0, after)], ObjectClass.BUILDING)
+        owner = (changes.owner.before if before is row else changes.owner.after)[: len(row)]
+        for low, high, label in ((0, 7, "UNCHANGED"), (9, 13, gone), (15, 19, lower), (21, 30, "UNCHANGED")):
+            found = changes.label[owner[(x > low) & (x < high)]]
+            assert {ChangeLabel(int(code)).name for code in found} == {label}
+
+
+@pytest.mark.parametrize(
+    ("end", "labels"), [(19.0, ["UNCHANGED", "INCREASED"]), (22.5, ["INCREASED"])], ids=["a house", "a strip"]
+)
+def test_a_row_of_which_most_rose_leaves_what_is_as_large_as_a_house(end: float, labels: list[str]) -> None:
+    row = roof((0, 24), (0, 9), 6.0)
+    raised = row.copy()
+    raised[row[:, 0] < end, 2] += 1.4
+    changes = decide([(0, row)], [(0, raised)], ObjectClass.BUILDING)
+    assert [ChangeLabel(code).name for code in sorted(changes.label)] == labels
+
+
 def test_an_annex_of_a_house_that_stands_alone_makes_it_grow() -> None:
     house, annex = roof((0, 10), (0, 9), 6.0), roof((10, 13.5), (2, 7), 2.7)
     changes = decide([(0, house)], [(0, np.concatenate([house, annex]))], ObjectClass.BUILDING)

@@ -167,6 +167,23 @@ def test_only_a_superpoint_around_a_corner_is_split() -> None:
     assert n == len(set(zip(part.tolist(), piece.tolist(), strict=True))) == 3
 
 
+@pytest.mark.parametrize(("least_m2", "expected"), [(25.0, ObjectClass.BUILDING), (0.0, ObjectClass.OTHER)])
+def test_roofs_that_step_a_little_are_a_roof_from_the_air(least_m2: float, expected: ObjectClass) -> None:
+    rng = np.random.default_rng(6)
+    roofs = [
+        sheet(rng, np.array([8.0 * i, 0, 6 + 0.36 * (i % 2)]), np.array([8.0, 0, 0]), np.array([0, 9.0, 0]), 20)
+        for i in range(4)
+    ]
+    aerial = Parameters.preset("aerial").with_setting(f"semantics.stepped_roof_m2={least_m2}")
+    xyz = fuse_points(to_local_grid(np.concatenate(roofs)), aerial.fuse).xyz
+    features = eigen_features(xyz, xyz[:, 2], aerial.features)
+    one = np.zeros(len(xyz), dtype=np.int32)
+    semantics = classify(xyz, aerial.fuse.leaf_m, features, one, 1, aerial.semantics)
+    codes, counts = np.unique(semantics.classification, return_counts=True)
+    assert codes[np.argmax(counts)] == expected
+    assert counts.max() > 0.9 * len(xyz)
+
+
 def test_cells_climb_to_the_maximum_around_them() -> None:
     rng = np.random.default_rng(5)
     surface = rng.integers(0, 20, (9, 7)).astype(float)

@@ -86,7 +86,7 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, 
     against a shed, the two are one new object: the region that the other epoch shows too becomes a part.
 
     Other objects shorter than ``part_of_length_m`` that both epochs have stay whole, and so does an object of which a
-    region takes most columns, unless that is a new house.
+    region takes most columns, unless that is a new house, or leaves as much of a body as a house has.
 
     A building up to that length is one house, or two of which one came or went. What changed of a longer one is part
     of a house in a row: ``frontage_m`` of the row about it are taken out too, as the house that it is a part of.
@@ -117,14 +117,14 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, 
     own, clear = cells.owner, cells.voxels.is_clear
     size = params.part_min_voxels, params.part_min_width_m / params.voxel_m
     plant = 1, params.plant_width_m / params.voxel_m
+    bare = cells.bare_columns
     regions = [
-        *connected_regions(cells, own, cells.is_lost, is_split, *size, is_clear=clear.after),
-        *connected_regions(cells, own.swapped, cells.is_gained, is_split, *size, is_clear=clear.before),
+        *_changed_regions(cells, own, cells.is_lost, bare.after, clear.after, is_split, params),
+        *_changed_regions(cells, own.swapped, cells.is_gained, bare.before, clear.before, is_split, params),
         *connected_regions(cells, own, cells.is_near.after, is_alone, *size),
         *connected_regions(cells, own.swapped, cells.is_near.before, is_alone, *size),
     ]
     if is_plant.any():
-        bare = cells.bare_columns
         plants = connected_regions(cells, own, bare.after, is_plant, *plant)
         plants += connected_regions(cells, own.swapped, bare.before, is_plant, *plant)
         regions += [region for region in plants if region.share_new > 0.5]  # not a crown that rose
@@ -152,6 +152,39 @@ def split_parts(cells: Cells, surfaces: Pair[Surface], object_class: ByteArray, 
     is_extension = np.concatenate([nothing, is_extension])
     parent = np.where(parent < 0, n - 1 - parent, parent)  # a part of another part
     return Parts(surfaces.map(taken), np.concatenate([nobody, parent]).astype(np.int32), is_house, is_extension)
+
+
+def _changed_regions(
+    cells: Cells,
+    owner: Pair[IntArray],
+    is_in: BoolArray,
+    is_bare: BoolArray,
+    is_clear: BoolArray,
+    is_split: BoolArray,
+    params: ChangeParams,
+) -> list[Region]:
+    """Regions of gained, or of lost, voxels ``is_in`` (c,) of the objects ``is_split`` (n,); of bodies, a house that
+    came or went apart from the storey of the house beside it.
+
+    ``owner``, ``is_bare`` and ``is_clear`` (c,) as in `connected_regions` and `Cells.bare_columns`, of this epoch and
+    of the other.
+    """
+    size = params.part_min_voxels, params.part_min_width_m / params.voxel_m
+    regions = connected_regions(cells, owner, is_in, is_split, *size, is_clear=is_clear)
+    if not params.fills_buildings or not regions:
+        return regions
+    house = int(np.ceil(params.part_is_new_m3 / params.voxel_m**3)), size[1]
+    houses = connected_regions(cells, owner, is_in & is_bare, is_split, *house)
+    rest = is_in.copy()
+    for region in houses:
+        rest[region.voxels] = False
+    storeys = [r for r in connected_regions(cells, owner, rest, is_split, *size) if _has_house(r.columns, params)]
+    number = np.full(len(is_in), -1)
+    for i, region in enumerate(regions):
+        number[region.voxels] = i
+    is_both = set(number[[r.voxels[0] for r in houses]]) & set(number[[r.voxels[0] for r in storeys]])
+    pieces = [r for r in houses + storeys if number[r.voxels[0]] in is_both]
+    return [r for i, r in enumerate(regions) if i not in is_both] + pieces
 
 
 def largest_regions(cells: Cells, n: int, params: ChangeParams) -> Pair[FloatArray]:
@@ -356,6 +389,19 @@ def _under(region: Int64Array, columns: Int64Array, *, fills_hull: bool) -> Bool
     return np.asarray(np.isfinite(distance))
 
 
+def _has_house(columns: Int64Array, params: ChangeParams) -> bool:
+    """Whether a connected piece of the columns (k, 2) is as large as the least house, and as wide."""
+    least = (_WIDE * params.frontage_m / params.voxel_m) ** 2
+    if len(columns) < least:
+        return False
+    label = components(cKDTree(columns).query_pairs(1.5, output_type="ndarray"), len(columns))
+    pieces = Groups(label, int(label.max()) + 1)
+    return any(
+        width_of(columns[pieces.members(i)]) * params.voxel_m >= _WIDE * params.frontage_m
+        for i in np.flatnonzero(pieces.counts >= least).tolist()
+    )
+
+
 def _claim(
     regions: list[Region],
     columns_of: tuple[Int64Array, Int64Array],
@@ -385,7 +431,9 @@ def _claim(
         is_new = is_new and (is_in_row or is_wide)
         most_of = 1.0 if is_new or is_plant[region.parent] else _MOST_OF_ROW if is_in_row else _MOST_OF
         if np.count_nonzero(is_inside) > most_of * (last - first):
-            continue
+            rest = rows[first:last, 1:][~is_inside & (part_of[first:last] < 0)]
+            if roofs is None or not has_houses[region.parent] or not _has_house(rest, params):
+                continue
         is_free = is_inside & (part_of[first:last] < 0)
         width_m = float((np.ptp(region.columns, axis=0) + 1).max()) * params.voxel_m
         if has_houses[region.parent] and roofs is None and width_m <= _LEAST_ANNEX_M:

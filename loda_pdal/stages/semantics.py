@@ -19,6 +19,12 @@ from loda_pdal.stages.parked import parked_vehicles
 
 _LINEARITY, _PLANARITY, _SPHERICITY, _VERTICAL, _HEIGHT = range(5)
 
+_FLAT = 0.05
+"""Largest median sphericity of a roof; plants begin far above it."""
+
+_LEVEL = 0.7
+"""Smallest |n.z| of the plane through a roof of several levels."""
+
 
 @dataclass(frozen=True)
 class Planes:
@@ -106,6 +112,8 @@ def classify(
     is_planar &= planes.rmse < params.building_rmse_m
     plane_group = _coplanar(planes, is_planar, adjacency, params.merge_angle_deg, 2 * params.building_rmse_m)
     is_building = _building(xyz, leaf_m, groups, values[:, _HEIGHT], height, planes, plane_group, params)
+    if params.stepped_roof_m2 > 0:
+        is_building |= _stepped_roof(xyz, leaf_m, groups, values, height, params) & ~is_planar & ~is_ground
     is_round = groups.median(values[:, _SPHERICITY]) > params.vegetation_sphericity
     is_vegetation = is_round & (height > params.vegetation_height_m) & ~(is_ground | is_building)
     azimuth_spread = _azimuth_spread(features.normals, groups.only(is_vegetation))
@@ -210,6 +218,19 @@ def _building(
     is_facade = is_vertical & (area > params.building_area_m2) & (top > params.building_top_m)
     is_roof = ~is_vertical & (area > params.roof_area_m2) & (height > params.roof_height_m) & params.has_roofs
     return np.asarray((plane_group >= 0) & (is_facade | is_roof))
+
+
+def _stepped_roof(
+    xyz: FloatArray, leaf_m: float, groups: Groups, values: np.ndarray, height: FloatArray, params: SemanticParams
+) -> BoolArray:
+    """Level superpoints (n,) that are flat all over but lie in no one plane: the roofs of a row, each a little higher
+    than the next."""
+    is_flat = groups.median(values[:, _PLANARITY]) > params.building_planarity
+    is_flat &= groups.median(values[:, _SPHERICITY]) < _FLAT
+    is_flat &= height > params.roof_height_m
+    is_flat &= np.abs(fit_planes(xyz, groups.only(is_flat)).normal[:, 2]) > _LEVEL
+    area = count_cells(xyz[:, :2], groups.labels, groups.n, 2 * leaf_m) * (2 * leaf_m) ** 2
+    return np.asarray(is_flat & (area > params.stepped_roof_m2))
 
 
 def support_area(xyz: FloatArray, groups: Groups, planes: Planes, cell_m: float) -> FloatArray:
