@@ -219,8 +219,8 @@ def _divided(surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, p
         cast = cast.with_more(cast.surfaces.map(lambda side: goes_to[side.owner]), host[:0]).settled(voxels)
         cells = cast.cells(voxels, params)
     if params.find_parts and params.needs_sight and not params.fills_buildings:
-        is_row = cast.is_pair & (cast.object_class == ObjectClass.BUILDING) & (params.frontage_m > 0)
-        cast = cast.with_more(*split_houses(cells, cast.surfaces, is_row, params)).settled(voxels)
+        is_asked = cast.is_pair & (cast.object_class == ObjectClass.BUILDING) & (params.frontage_m > 0)
+        cast = cast.with_more(*split_houses(cells, cast.surfaces, is_asked, params)).settled(voxels)
         cells = cast.cells(voxels, params)
     if params.find_parts:
         cast = cast.with_parts(split_parts(cells, cast.surfaces, cast.object_class, params)).settled(voxels)

@@ -13,17 +13,20 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from loda_pdal.model.boxes import upright_boxes
-from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array, IntArray
+from loda_pdal.model.cloud import BoolArray, FloatArray, IntArray
 from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams
-from loda_pdal.stages.cues import Cells, Surface, Voxels
+from loda_pdal.stages.cues import Cells, Surface
 from loda_pdal.stages.parts import Region, connected_regions
 
 _NARROWEST = 0.5
 """No front is narrower than this many frontages."""
 
-_AS_HIGH = 0.6
+_AS_HIGH = 0.65
 """A front reaches at least this share of the height of the row beside it; what is built onto a house does not."""
+
+_LEAST_M = 3.0
+"""No house is lower: where hardly anything of the row is seen, an annex is as high."""
 
 _CLOSED = 0.5
 """Voxels of a front for each that it has room for: a crown is open."""
@@ -60,7 +63,7 @@ def split_houses(
     surfaces : Pair of Surface
         Points with their objects, 0 to ``n - 1``.
     is_asked : (n,) bool
-        Buildings that both epochs have.
+        Buildings that both epochs have; those longer than ``part_of_length_m`` are rows.
 
     Returns
     -------
@@ -70,8 +73,11 @@ def split_houses(
         The object that each house was part of.
     """
     n, own, bare = len(is_asked), cells.owner, _bare(cells)
-    gone = _fronts(cells, own, cells.is_lost & bare.after, is_asked, params)
-    come = _fronts(cells, own.swapped, cells.is_gained & bare.before, is_asked, params)
+    xyz = np.concatenate([side.xyz for side in surfaces])
+    label = np.concatenate([side.owner for side in surfaces])
+    is_row = is_asked & (upright_boxes(xyz, label, n).size[:, 0] > params.part_of_length_m)
+    gone = _fronts(cells, own, cells.is_lost & bare.after, is_row, params)
+    come = _fronts(cells, own.swapped, cells.is_gained & bare.before, is_row, params)
     near = cells.voxels.at_points(cells.is_near.swapped, surfaces)
     owner = Pair(
         _given(surfaces.before, near.before, gone, n, params),
@@ -99,15 +105,16 @@ def _fronts(
         if float(np.hypot(*(np.ptp(region.columns, axis=0) + 1))) * params.voxel_m <= shortest:
             continue
         centre = cells.voxels.centre[region.voxels]
-        least = _AS_HIGH * _height_of_row(cells, owner, region, params)
-        top = np.quantile(centre[:, 2], 0.95)
-        if top - centre[:, 2].min() < least:
+        least = max(_AS_HIGH * _height_of_row(cells, owner, region, params), _LEAST_M)
+        foot = float(centre[:, 2].min())
+        if np.quantile(centre[:, 2], 0.95) - foot < least:
             continue
-        plan, column = np.unique(cells.voxels.cell[region.voxels, :2], axis=0, return_inverse=True)
-        column = column.ravel()
-        highest = np.full(len(plan), -np.inf)
-        np.maximum.at(highest, column, centre[:, 2])
-        is_front = (highest - centre[:, 2].min() >= least)[column]
+        # voxels are sorted: the last one of a column is its highest
+        _, first, column = np.unique(
+            cells.voxels.cell[region.voxels, :2], axis=0, return_index=True, return_inverse=True
+        )
+        highest = centre[np.append(first[1:], len(centre)) - 1, 2]
+        is_front = (highest - foot >= least)[column.ravel()]
         box = upright_boxes(centre, np.where(is_front, 0, -1).astype(np.int32), 1)
         length = float(box.size[0, 0]) + params.voxel_m
         if length <= shortest:
@@ -124,9 +131,8 @@ def _height_of_row(cells: Cells, owner: Pair[IntArray], region: Region, params: 
     there are few."""
     cell = cells.voxels.cell
     reach = int(np.ceil(params.frontage_m / params.voxel_m))
-    first, last = np.searchsorted(cell[:, 0], region.columns[:, 0].min() - reach), np.searchsorted(
-        cell[:, 0], region.columns[:, 0].max() + reach, side="right"
-    )
+    along = region.columns[:, 0]
+    first, last = np.searchsorted(cell[:, 0], [along.min() - reach, along.max() + reach + 1])
     is_own = (owner.before[first:last] == region.parent) | (owner.after[first:last] == region.parent)
     own = first + np.flatnonzero(is_own)
     plan, lowest = np.unique(cell[own, :2], axis=0, return_index=True)
@@ -139,19 +145,12 @@ def _height_of_row(cells: Cells, owner: Pair[IntArray], region: Region, params: 
     return float(np.median(top[is_beside]) - np.quantile(z[lowest[is_beside]], 0.1)) + params.voxel_m
 
 
-def _given(
-    surface: Surface, is_near: BoolArray, fronts: list[_Front], first: int, params: ChangeParams
-) -> IntArray:
+def _given(surface: Surface, is_near: BoolArray, fronts: list[_Front], first: int, params: ChangeParams) -> IntArray:
     """Objects (m,) of the points, those behind and before a front, and not in the other survey ``is_near`` (m,), given
     to its house."""
     owner = surface.owner.copy()
     for number, front in enumerate(fronts, first):
         own = np.flatnonzero((owner == front.parent) & ~is_near)
-        owner[own[_is_of(front, surface.xyz[own], params)]] = number
+        s, t = np.abs((surface.xyz[own, :2] - front.middle) @ front.axes.T).T
+        owner[own[(s <= front.half_m + _EDGE_M) & (t <= params.part_of_length_m)]] = number
     return owner
-
-
-def _is_of(front: _Front, xyz: FloatArray, params: ChangeParams) -> BoolArray:
-    """Which of the places (k, 3) m lie where the house with this front stands."""
-    s, t = np.abs((xyz[:, :2] - front.middle) @ front.axes.T).T
-    return np.asarray((s <= front.half_m + _EDGE_M) & (t <= params.part_of_length_m))
