@@ -256,6 +256,46 @@ def test_a_party_wall_that_shows_when_the_house_beside_it_goes_has_not_changed()
     assert [label.swapped for label in labels(found)] == labels(back)
 
 
+def front(x: float, length: float, top: float) -> tuple[FloatArray, FloatArray]:
+    """What the street shows of houses of a row: the wall along y = 0."""
+    points, normals = block(x, 0, length, 8, top)
+    is_front = (points[:, 1] == 0) & (normals[:, 1] == -1)
+    return points[is_front], normals[is_front]
+
+
+def test_a_narrow_house_of_a_row_is_removed_whose_front_alone_is_seen() -> None:
+    """5 m of a row 9 m high: a sheet of less than 20 m3, of which a porch would be a piece."""
+    whole, rest = front(0, 30, 9), joined(front(0, 12, 9), front(17, 13, 9))
+    before, after = surface((0, whole)), surface((0, rest))
+    found, back = decide(before, after, ObjectClass.BUILDING), decide(after, before, ObjectClass.BUILDING)
+    assert sorted(labels(found)) == [ChangeLabel.UNCHANGED, ChangeLabel.REMOVED]
+    x = before.xyz[found.owner.before == labels(found).index(ChangeLabel.REMOVED), 0]
+    assert 12.0 <= x.min() <= 13.0
+    assert 16.0 <= x.max() <= 17.0
+    assert [label.swapped for label in labels(found)] == labels(back)
+
+
+def test_a_house_that_goes_beside_one_that_loses_a_storey_is_removed_and_the_other_decreased() -> None:
+    whole = front(0, 32, 9)
+    rest = joined(front(0, 12, 9), front(18, 6, 6), front(24, 8, 9))
+    before, after = surface((0, whole)), surface((0, rest))
+    found, back = decide(before, after, ObjectClass.BUILDING), decide(after, before, ObjectClass.BUILDING)
+    middle = [int(found.owner.before[np.argmin(np.linalg.norm(before.xyz - [x, 0, z], axis=1))])
+              for x, z in ((15, 4), (21.5, 8))]  # fmt: skip
+    assert [labels(found)[i] for i in middle] == [ChangeLabel.REMOVED, ChangeLabel.DECREASED]
+    assert [label.swapped for label in labels(found)] == labels(back)
+
+
+def test_a_wide_annex_before_a_row_is_no_house_of_it() -> None:
+    annex = block(12, -3, 6, 3, 3)
+    annex = tuple(part[annex[0][:, 1] < 0] for part in annex)
+    row = front(0, 30, 9)
+    is_hidden = (row[0][:, 0] > 12) & (row[0][:, 0] < 18) & (row[0][:, 2] < 3)
+    shown = row[0][~is_hidden], row[1][~is_hidden]
+    found = decide(surface((0, row)), surface((0, joined(shown, (annex[0], annex[1])))), ObjectClass.BUILDING)
+    assert set(labels(found)) == {ChangeLabel.UNCHANGED, ChangeLabel.INCREASED}
+
+
 def crown(x: float, length: float) -> tuple[FloatArray, FloatArray]:
     """The upper half of a box 6 m high."""
     points, normals = block(x, 0, length, 3, 6)

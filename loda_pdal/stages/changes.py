@@ -25,6 +25,7 @@ from loda_pdal.stages.cues import Cells, Evidence, Surface, Voxels, median_rise,
 from loda_pdal.stages.faces import face_offset
 from loda_pdal.stages.observability import Coverage
 from loda_pdal.stages.parts import largest_regions, split_parts
+from loda_pdal.stages.rows import split_houses
 from loda_pdal.stages.rules import (
     NEXT_TO_NOTHING,
     Cue,
@@ -216,6 +217,10 @@ def _divided(surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, p
             cast = _with_close_things(cast, voxels, cells, params)
         goes_to = carried_on(cast.surfaces, np.isin(cast.object_class, (ObjectClass.VEGETATION, ObjectClass.OTHER)))
         cast = cast.with_more(cast.surfaces.map(lambda side: goes_to[side.owner]), host[:0]).settled(voxels)
+        cells = cast.cells(voxels, params)
+    if params.find_parts and params.needs_sight and not params.fills_buildings:
+        is_asked = cast.is_pair & (cast.object_class == ObjectClass.BUILDING) & (params.frontage_m > 0)
+        cast = cast.with_more(*split_houses(cells, cast.surfaces, is_asked, params)).settled(voxels)
         cells = cast.cells(voxels, params)
     if params.find_parts:
         cast = cast.with_parts(split_parts(cells, cast.surfaces, cast.object_class, params)).settled(voxels)

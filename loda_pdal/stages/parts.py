@@ -428,7 +428,7 @@ def _claim(
         is_new = bool(has_houses[region.parent]) and region.share_new > 0.5
         is_new = is_new and region.n_voxels * params.voxel_m**3 > params.part_is_new_m3
         is_wide = roofs is None and _least_side(region.columns) * params.voxel_m > _WIDE * params.frontage_m
-        is_new = is_new and (is_in_row or is_wide)
+        is_new = is_new and (is_wide if roofs is None else is_in_row)
         most_of = 1.0 if is_new or is_plant[region.parent] else _MOST_OF_ROW if is_in_row else _MOST_OF
         if np.count_nonzero(is_inside) > most_of * (last - first):
             rest = rows[first:last, 1:][~is_inside & (part_of[first:last] < 0)]
