@@ -82,13 +82,16 @@ def match_instances(
         Surfaces closer than this are the same surface.
     """
     pairs = _assign_by_class(instances, descriptors, params)
-    if proxy_pairs is not None:
-        pairs = np.concatenate([pairs, _pairs_by_proxy(instances, *proxy_pairs, pairs)])
     n_before, n_after = len(instances.before), len(instances.after)
     votes = Pair(
         _shared_space(*bodies.before, n_before, *bodies.after, reach_m),
         _shared_space(*bodies.after, n_after, *bodies.before, reach_m),
     )
+    if proxy_pairs is not None:
+        by_proxy = _pairs_by_proxy(instances, *proxy_pairs, pairs)
+        is_elsewhere = votes.before.is_shown_elsewhere(*by_proxy.T) | votes.after.is_shown_elsewhere(*by_proxy.T[::-1])
+        is_elsewhere &= np.isin(instances.before.object_class[by_proxy[:, 0]], (ObjectClass.MOBILE, ObjectClass.OTHER))
+        pairs = np.concatenate([pairs, by_proxy[~is_elsewhere]])
     left = Pair(_left_over(votes.before, pairs[:, 0]), _left_over(votes.after, pairs[:, 1]))
     is_apart = left.map(lambda side: np.zeros(len(side), np.bool_))
     if params.splits_merged:
@@ -122,6 +125,11 @@ class _Votes:
     support: FloatArray
     partner: IntArray
     nearest: IntArray
+
+    def is_shown_elsewhere(self, own: IntArray, other: IntArray) -> BoolArray:
+        """Whether the other epoch shows most of the instances ``own`` (p,), and not as the instances ``other`` (p,): of
+        two vans of one proxy each epoch may call another one a vehicle."""
+        return np.asarray((self.support[own] >= _MIN_SHARED) & (self.partner[own] != other))
 
 
 def _assign_by_class(instances: Pair[Instances], descriptors: Pair[Descriptors], params: AssociationParams) -> IntArray:
