@@ -191,6 +191,7 @@ def test_what_each_epoch_calls_by_another_name_stays_in_its_place() -> None:
         ),
         0.6,
         PARAMS,
+        has_sides=True,
     )
     np.testing.assert_array_equal(found.owner.before, found.owner.after)
     np.testing.assert_array_equal(found.owner.before, which)

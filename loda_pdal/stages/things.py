@@ -256,7 +256,7 @@ class _Line(NamedTuple):
 
 def _lines(side: Surface, other: Surface, is_piece: BoolArray, is_rest: BoolArray) -> list[_Line]:
     """Pieces of one epoch and the rests that carry them on, of several rests that of most contacts last; ``is_piece``
-    and ``is_rest`` (n + 1,)."""
+    and ``is_rest`` (n + 1,). Where both make one long box, all of the rest is the hedge."""
     piece, rest = np.flatnonzero(is_piece[side.owner]), np.flatnonzero(is_rest[side.owner])
     if len(piece) == 0 or len(rest) == 0:
         return []
@@ -265,13 +265,22 @@ def _lines(side: Surface, other: Surface, is_piece: BoolArray, is_rest: BoolArra
     pairs, contacts = np.unique(touching.astype(np.int64), axis=0, return_counts=True)
     n = len(is_piece) - 1
     groups = Groups(np.where(np.isin(side.owner, pairs), side.owner, -1), n)
-    axes = upright_boxes(side.xyz, groups.labels, n).axes[:, :2]
+    boxes = upright_boxes(side.xyz, groups.labels, n)
+    axes, size = boxes.axes[:, :2], boxes.size[:, :2]
+    top = groups.quantile(side.xyz[:, 2], 0.95)
     is_low = groups.maximum(side.height) <= LOW_M
     shown = np.zeros(len(side.xyz), np.bool_)
     shown[rest] = nearest(other.xyz[is_rest[other.owner]], side.xyz[rest], _POINT_M)[0] >= 0
     lines = []
     for i, j in pairs[np.argsort(contacts, kind="stable")].tolist():
         own, host = side.xyz[groups.members(i)], groups.members(j)
+        both = np.concatenate([own, side.xyz[host]])
+        length, width = upright_boxes(both, np.zeros(len(both), np.int32), 1).size[0, :2]
+        is_whole = length >= max(size[i].max() + size[j].max() - _CONTACT_M, _LINE * width)
+        is_whole &= width <= max(size[i].min(), size[j].min()) + _ASIDE_M and abs(top[i] - top[j]) <= _ASIDE_M / 2
+        if is_whole:
+            lines.append(_Line(i, j, axes[i, 1], -np.inf, np.inf))
+            continue
         across = _carried_across(own, side.xyz[host], shown[host], axes[i]) if is_low[i] else None
         if across is not None:
             aside = own @ across
@@ -290,6 +299,8 @@ def _carried_across(piece: FloatArray, rest: FloatArray, is_shown: BoolArray, ax
     beside = nearest(piece * _FLAT, rest * _FLAT, _CARRIES_ON_M)[0] >= 0
     for along, across in (axes, axes[::-1]):
         own, aside = piece @ across, rest @ across
+        if np.ptp(own) > _HEDGE_M:
+            continue
         is_in = (aside >= own.min() - _ASIDE_M / 2) & (aside <= own.max() + _ASIDE_M / 2)
         for part in (is_in & beside, is_in):
             if not part.any() or np.mean(is_shown[part]) < _BOTH or np.ptp(aside[part]) < _AS_WIDE * np.ptp(own):
@@ -319,6 +330,9 @@ _ASIDE_M = 0.25
 
 _BOTH = 0.5
 """Share of what carries a piece on that the other epoch shows too: it is the rest of the hedge, and did not pass by."""
+
+_HEDGE_M = 1.5
+"""Hedges are no wider, and vehicles are: one behind another makes no hedge."""
 
 _NEARLY_ALL = 0.8
 """Share of a rest that lies in its line, from which on it is nothing but the hedge."""
