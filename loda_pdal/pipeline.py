@@ -257,7 +257,8 @@ def match_objects(
     proxy_pairs = None if proxies is None else (proxies.proxies.map(lambda side: side.proxy), proxies.matches)
     xyz = clouds.map(lambda cloud: cloud.xyz)
     space = at_once(lambda cloud, g, i: bodies(cloud.xyz, g.height, i, p.changes), clouds, ground, instances)
-    return match_instances(xyz, instances, space, descriptors, proxy_pairs, p.changes.query_radius_m, p.association)
+    reach_m, has_sides = p.changes.query_radius_m, p.changes.needs_sight
+    return match_instances(xyz, instances, space, descriptors, proxy_pairs, reach_m, p.association, has_sides=has_sides)
 
 
 def look(

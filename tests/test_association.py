@@ -12,8 +12,12 @@ from hypothesis import strategies as st
 from reference.association import least_total
 
 from loda_pdal.model.boxes import Boxes, box_iou
+from loda_pdal.model.labels import ObjectClass
+from loda_pdal.model.pair import Pair
 from loda_pdal.params import AssociationParams
-from loda_pdal.stages.association import Descriptors, associate, chi_square, describe
+from loda_pdal.stages.association import Descriptors, Matches, associate, chi_square, describe
+from loda_pdal.stages.correspondence import match_instances
+from loda_pdal.stages.instances import Instances
 
 PARAMS = AssociationParams()
 
@@ -162,3 +166,32 @@ def test_nothing_to_match() -> None:
         assert (len(found), found.before_idx.dtype, found.cost.dtype) == (0, np.int32, np.float64)
     described = describe(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=int), 0, 10, 0.5, "pca")
     assert described.histogram.shape == (0, 10)
+
+
+def test_what_each_epoch_calls_by_another_name_stays_in_its_place() -> None:
+    """Of two vans in one proxy the first epoch knows one as a vehicle, the second the other."""
+    van = np.stack(np.meshgrid(np.arange(0, 5, 0.25), np.arange(0, 2, 0.25), [1.0]), axis=-1).reshape(-1, 3)
+    xyz = np.concatenate([van, van + np.array([5.5, 0.0, 0.0])])
+    which = np.repeat([0, 1], len(xyz) // 2)
+    one_proxy = np.ones(len(xyz), np.int32)
+    kinds = Pair([ObjectClass.MOBILE, ObjectClass.OTHER], [ObjectClass.OTHER, ObjectClass.MOBILE])
+    instances = kinds.map(
+        lambda kind: Instances(
+            (which + 1).astype(np.int32), np.array(kind, dtype=np.uint8), np.array(kind, dtype=np.uint8)[which]
+        )
+    )
+    found = match_instances(
+        Pair(xyz, xyz),
+        instances,
+        instances.map(lambda side: (xyz, side.instance)),
+        Pair(*[describe(xyz, xyz[:, 2], which + 1, 2, 10, 0.5, "upright")] * 2),
+        (
+            Pair(one_proxy, one_proxy),
+            Matches(np.zeros(1, np.int32), np.zeros(1, np.int32), np.zeros(1), np.ones(1)),
+        ),
+        0.6,
+        PARAMS,
+        has_sides=True,
+    )
+    np.testing.assert_array_equal(found.owner.before, found.owner.after)
+    np.testing.assert_array_equal(found.owner.before, which)

@@ -463,6 +463,45 @@ def test_a_hedge_of_which_a_part_was_taken_out_is_less_of_a_hedge(kind: ObjectCl
     assert labels(decide(after, before, *classes)) == [ChangeLabel.INCREASED]
 
 
+@pytest.mark.parametrize("gone_m", [(1.5, 3.5), (3.0, 5.0)], ids=["in the middle", "at the end"])
+def test_a_bush_before_a_hedge_is_none_of_it(gone_m: tuple[float, float]) -> None:
+    """The bush is merged with the hedge in both surveys, and stays; of the hedge a piece went."""
+    points, facing = hedge(0, 5)
+    is_gone = (points[:, 0] > gone_m[0]) & (points[:, 0] < gone_m[1])
+    stays, gone = (points[~is_gone], facing[~is_gone]), (points[is_gone], facing[is_gone])
+    aside, around = hedge(0, 1.25)
+    bush = aside[:, [1, 0, 2]] * [1, 1, 0.8] + [0.25, 0.8, 0.0], around
+    before, after = surface((0, joined(stays, bush)), (1, gone)), surface((0, joined(stays, bush)))
+    for found, side, label in (
+        (decide(before, after, *[ObjectClass.VEGETATION] * 2), "before", ChangeLabel.DECREASED),
+        (decide(after, before, *[ObjectClass.VEGETATION] * 2), "after", ChangeLabel.INCREASED),
+    ):
+        shown = np.concatenate([stays[0], bush[0], gone[0]])
+        of_all = found.label[getattr(found.owner, side)[: len(shown)]]
+        is_hedge = shown[:, 1] < 0.75
+        assert np.all(of_all[~is_hedge & (shown[:, 1] > 1.1)] == ChangeLabel.UNCHANGED)
+        assert np.mean(of_all[is_hedge] == label) > 0.8
+
+
+def test_a_table_taken_from_a_row_is_gone() -> None:
+    """Tables stand in a line, as wide and as high, and as rough as foliage with all that stands on them and about."""
+    rng = np.random.default_rng(3)
+    boards = rng.random((200, 3)) * [1.2, 0.7, 0.3] + [0.0, 0.0, 0.5]
+    feet = rng.random((100, 3)) * [1.7, 0.7, 0.5]
+    table = np.concatenate([boards, feet])
+
+    def row(n: int) -> tuple[FloatArray, FloatArray]:
+        points = np.concatenate([table + np.array([1.7 * i, 0.0, 0.0]) for i in range(n)])
+        facing = rng.normal(size=points.shape)
+        return points, facing / np.linalg.norm(facing, axis=1, keepdims=True)
+
+    two, three = row(2), row(3)
+    is_third = three[0][:, 0] > 3.4
+    gone = three[0][is_third], three[1][is_third]
+    found = decide(surface((0, two), (1, gone)), surface((0, two)), *[ObjectClass.OTHER] * 2)
+    assert labels(found) == [ChangeLabel.UNCHANGED, ChangeLabel.REMOVED]
+
+
 def test_a_bin_at_the_end_of_a_hedge_is_a_thing_of_its_own() -> None:
     stays, box = hedge(0, 4), block(4.25, 0, 0.75, 0.75, 1.25)
     found = decide(surface((0, joined(stays, box))), surface((0, stays)), ObjectClass.OTHER)

@@ -215,8 +215,8 @@ def _divided(surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, p
         cast = cast.with_more(owner, host)
         if params.needs_sight:
             cast = _with_close_things(cast, voxels, cells, params)
-        goes_to = carried_on(cast.surfaces, np.isin(cast.object_class, (ObjectClass.VEGETATION, ObjectClass.OTHER)))
-        cast = cast.with_more(cast.surfaces.map(lambda side: goes_to[side.owner]), host[:0]).settled(voxels)
+        is_leafy = np.isin(cast.object_class, (ObjectClass.VEGETATION, ObjectClass.OTHER))
+        cast = cast.with_more(carried_on(cast.surfaces, is_leafy), host[:0]).settled(voxels)
         cells = cast.cells(voxels, params)
     if params.find_parts and params.needs_sight and not params.fills_buildings:
         is_asked = cast.is_pair & (cast.object_class == ObjectClass.BUILDING) & (params.frontage_m > 0)

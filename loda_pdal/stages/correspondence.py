@@ -64,6 +64,8 @@ def match_instances(
     proxy_pairs: tuple[Pair[IntArray], Matches] | None,
     reach_m: float,
     params: AssociationParams,
+    *,
+    has_sides: bool,
 ) -> Objects:
     """Objects from the instances of both epochs.
 
@@ -80,15 +82,22 @@ def match_instances(
         proxies and in no pair of their own are paired too. None where the preset has no proxies.
     reach_m : float
         Surfaces closer than this are the same surface.
+    has_sides : bool
+        Whether the surveys show the sides of things: then what takes one's space is told well enough to keep what lies
+        in one proxy from being paired across.
     """
     pairs = _assign_by_class(instances, descriptors, params)
-    if proxy_pairs is not None:
-        pairs = np.concatenate([pairs, _pairs_by_proxy(instances, *proxy_pairs, pairs)])
     n_before, n_after = len(instances.before), len(instances.after)
     votes = Pair(
         _shared_space(*bodies.before, n_before, *bodies.after, reach_m),
         _shared_space(*bodies.after, n_after, *bodies.before, reach_m),
     )
+    if proxy_pairs is not None:
+        by_proxy = _pairs_by_proxy(instances, *proxy_pairs, pairs)
+        own, other = by_proxy.T
+        is_elsewhere = _is_with_another(own, other, votes) | _is_with_another(other, own, votes.swapped)
+        is_elsewhere &= np.isin(instances.before.object_class[own], (ObjectClass.MOBILE, ObjectClass.OTHER)) & has_sides
+        pairs = np.concatenate([pairs, by_proxy[~is_elsewhere]])
     left = Pair(_left_over(votes.before, pairs[:, 0]), _left_over(votes.after, pairs[:, 1]))
     is_apart = left.map(lambda side: np.zeros(len(side), np.bool_))
     if params.splits_merged:
@@ -149,6 +158,15 @@ def _pairs_by_proxy(instances: Pair[Instances], proxy: Pair[IntArray], matches: 
                 taken.before.add(i)
                 taken.after.add(j)
     return np.array(found, dtype=np.int32).reshape(-1, 2)
+
+
+def _is_with_another(own: IntArray, other: IntArray, votes: Pair[_Votes]) -> BoolArray:
+    """Whether the instances ``own`` (p,) of one epoch take the same space as an instance of the other epoch that is not
+    ``other`` (p,): of two vans in one proxy each epoch may call another one a vehicle."""
+    host = votes.before.partner[own]
+    is_mutual = (host >= 0) & (votes.before.support[own] >= _MIN_SHARED)
+    is_mutual &= (votes.after.partner[host] == own) & (votes.after.support[host] >= _MIN_SHARED)
+    return np.asarray(is_mutual & (host != other))
 
 
 def _largest_by_proxy_and_class(instances: Instances, proxy: IntArray) -> dict[tuple[int, int], int]:

@@ -6,6 +6,8 @@ its own, where the other survey shows the ground and nothing of the object, is n
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from loda_pdal.kernels.clusters import linked
@@ -194,12 +196,12 @@ _LOW_FOOT_M = 0.6
 """Its lowest point lies no higher: hardly any ray reaches the ground right beside a neighbour."""
 
 
-def carried_on(surfaces: Pair[Surface], is_asked: BoolArray) -> IntArray:
-    """Where the points of each object go, (n + 1,), the last those of none: what one epoch alone shows of a hedge goes
-    back to the piece of it that both show.
+def carried_on(surfaces: Pair[Surface], is_asked: BoolArray) -> Pair[IntArray]:
+    """Object of each point (m,) once what one epoch alone shows of a hedge is one with the rest of it, that both show.
 
     Foliage that carries on other foliage in the same line, as wide and as high, is no thing beside it: a piece that was
     taken out of a hedge, or planted on to its end, changes the hedge. What is smooth may be one vehicle behind another.
+    Where the rest is merged with more than the hedge (a bush or a bench before it), what lies in the line leaves it.
 
     Parameters
     ----------
@@ -209,47 +211,134 @@ def carried_on(surfaces: Pair[Surface], is_asked: BoolArray) -> IntArray:
         Objects that may be such pieces.
     """
     n = len(is_asked)
-    goes_to = np.append(np.arange(n), -1).astype(np.int32)
     present = surfaces.map(lambda side: np.isin(np.arange(n), side.owner) & is_asked)
     is_pair = np.append(present.before & present.after, False)
-    pairs = surfaces.join(present, lambda side, own: _in_line(side, np.append(own, False) & ~is_pair, is_pair))
-    both = np.concatenate(list(pairs))
-    is_leafy = roughness(surfaces, np.isin(np.arange(n), both)) > FOLIAGE_M
-    for piece, host in both[is_leafy[both].all(axis=1)].tolist():
-        goes_to[piece] = host
-    return goes_to
+    single = present.map(lambda own: np.append(own, False) & ~is_pair)
+    before, after = surfaces
+    found = _lines(before, after, single.before, is_pair) + _lines(after, before, single.after, is_pair)
+    ends = np.array([(line.piece, line.rest) for line in found], dtype=np.int64).reshape(-1, 2)
+    is_leafy = roughness(surfaces, np.isin(np.arange(n), ends)) > FOLIAGE_M
+    line_of = {line.piece: line for line in found if is_leafy[line.piece] and is_leafy[line.rest]}
+    hedges: dict[int, list[_Line]] = {}
+    for line in line_of.values():
+        hedges.setdefault(line.rest, []).append(line)
+    owner = surfaces.map(lambda side: side.owner.copy())
+    groups = surfaces.map(lambda side: Groups(side.owner, n))
+    for rest, own in hedges.items():
+        members = [side.members(rest) for side in groups]
+        is_in = [
+            np.any([line.holds(side.xyz[member]) for line in own], axis=0)
+            for side, member in zip(surfaces, members, strict=True)
+        ]
+        is_whole = float(np.mean(np.concatenate(is_in))) >= _NEARLY_ALL
+        hedge = rest if is_whole else min(line.piece for line in own)
+        for side, grouped, member, inside in zip(owner, groups, members, is_in, strict=True):
+            side[member[inside | is_whole]] = hedge
+            for line in own:
+                side[grouped.members(line.piece)] = hedge
+    return owner
 
 
-def _in_line(side: Surface, is_piece: BoolArray, is_rest: BoolArray) -> Int64Array:
-    """Pieces and the rests that they touch, (p, 2), that lie one behind the other in a line, as wide and as high as
-    each other; of several rests that of most contacts comes last. ``is_piece`` and ``is_rest`` (n + 1,)."""
+class _Line(NamedTuple):
+    """A piece of a hedge, the rest of it, and the line of both: from ``low`` to ``high`` m along ``across`` (3,)."""
+
+    piece: int
+    rest: int
+    across: FloatArray
+    low: float
+    high: float
+
+    def holds(self, xyz: FloatArray) -> BoolArray:
+        """Which points (k, 3) lie in the line."""
+        aside = xyz @ self.across
+        return np.asarray((aside >= self.low) & (aside <= self.high))
+
+
+def _lines(side: Surface, other: Surface, is_piece: BoolArray, is_rest: BoolArray) -> list[_Line]:
+    """Pieces of one epoch and the rests that carry them on, of several rests that of most contacts last; ``is_piece``
+    and ``is_rest`` (n + 1,). Where both make one long box, all of the rest is the hedge."""
     piece, rest = np.flatnonzero(is_piece[side.owner]), np.flatnonzero(is_rest[side.owner])
     if len(piece) == 0 or len(rest) == 0:
-        return np.zeros((0, 2), dtype=np.int64)
+        return []
     found, _ = nearest(side.xyz[rest], side.xyz[piece], _CONTACT_M)
     touching = np.column_stack([side.owner[piece], side.owner[rest[found]]])[found >= 0]
     pairs, contacts = np.unique(touching.astype(np.int64), axis=0, return_counts=True)
-    pairs = pairs[np.argsort(contacts, kind="stable")]
     n = len(is_piece) - 1
     groups = Groups(np.where(np.isin(side.owner, pairs), side.owner, -1), n)
-    size = upright_boxes(side.xyz, groups.labels, n).size
+    boxes = upright_boxes(side.xyz, groups.labels, n)
+    axes, size = boxes.axes[:, :2], boxes.size[:, :2]
     top = groups.quantile(side.xyz[:, 2], 0.95)
-    member = np.concatenate([groups.members(i) for i in pairs.ravel().tolist()] or [rest[:0]])
-    label = np.repeat(np.arange(len(pairs)), groups.counts[pairs].sum(axis=1))
-    both = upright_boxes(side.xyz[member], label, len(pairs)).size
-    long, wide = size[:, :2].max(axis=1)[pairs], size[:, :2].min(axis=1)[pairs]
-    length, width = both[:, :2].max(axis=1), both[:, :2].min(axis=1)
-    is_behind = length >= long.sum(axis=1) - _CONTACT_M
-    is_as_wide = width <= wide.max(axis=1) + _ASIDE_M
-    is_as_high = np.abs(top[pairs[:, 0]] - top[pairs[:, 1]]) <= _ASIDE_M / 2
-    return np.asarray(pairs[is_behind & is_as_wide & is_as_high & (length >= _LINE * width)])
+    is_low = groups.maximum(side.height) <= LOW_M
+    shown = np.zeros(len(side.xyz), np.bool_)
+    shown[rest] = nearest(other.xyz[is_rest[other.owner]], side.xyz[rest], _POINT_M)[0] >= 0
+    lines = []
+    for i, j in pairs[np.argsort(contacts, kind="stable")].tolist():
+        own, host = side.xyz[groups.members(i)], groups.members(j)
+        both = np.concatenate([own, side.xyz[host]])
+        length, width = upright_boxes(both, np.zeros(len(both), np.int32), 1).size[0, :2]
+        is_whole = length >= max(size[i].max() + size[j].max() - _CONTACT_M, _LINE * width)
+        is_whole &= width <= max(size[i].min(), size[j].min()) + _ASIDE_M and abs(top[i] - top[j]) <= _ASIDE_M / 2
+        if is_whole:
+            lines.append(_Line(i, j, axes[i, 1], -np.inf, np.inf))
+            continue
+        across = _carried_across(own, side.xyz[host], shown[host], axes[i]) if is_low[i] else None
+        if across is not None:
+            aside = own @ across
+            lines.append(_Line(i, j, across, float(aside.min()) - _ASIDE_M / 2, float(aside.max()) + _ASIDE_M / 2))
+    return lines
+
+
+def _carried_across(piece: FloatArray, rest: FloatArray, is_shown: BoolArray, axes: FloatArray) -> FloatArray | None:
+    """The one of the ``axes`` (2, 3) of a piece (p, 3) across which a rest (r, 3) carries it on, as wide and as high;
+    None where it does not.
+
+    Of the rest only what lies in the piece's own line is looked at: a bush may stand before the hedge. It must be what
+    the other epoch shows too, ``is_shown`` (r,), and carry on either next to the piece (farther on the hedge may turn)
+    or as a whole, without a gap in its upper half: tables stand in a row, but each by itself.
+    """
+    beside = nearest(piece * _FLAT, rest * _FLAT, _CARRIES_ON_M)[0] >= 0
+    for along, across in (axes, axes[::-1]):
+        own, aside = piece @ across, rest @ across
+        if np.ptp(own) > _HEDGE_M:
+            continue
+        is_in = (aside >= own.min() - _ASIDE_M / 2) & (aside <= own.max() + _ASIDE_M / 2)
+        for part in (is_in & beside, is_in):
+            if not part.any() or np.mean(is_shown[part]) < _BOTH or np.ptp(aside[part]) < _AS_WIDE * np.ptp(own):
+                continue
+            both = np.concatenate([piece, rest[part]])
+            least = max(np.ptp(piece @ along) + _CONTACT_M, _LINE * np.ptp(own))
+            tops = [float(np.quantile(points[:, 2], 0.95)) for points in (piece, rest[part])]
+            is_high = both[:, 2] > (max(tops) + both[:, 2].min()) / 2
+            gaps = np.diff(np.sort(both[is_high] @ along))
+            if (
+                np.ptp(both[is_high] @ along) >= least
+                and gaps.max() <= _POINT_M
+                and abs(tops[0] - tops[1]) <= _ASIDE_M / 2
+            ):
+                return np.asarray(across)
+    return None
 
 
 _CONTACT_M = 0.5
 """What lies this near belongs together, as in the instances."""
 
+_CARRIES_ON_M = 1.0
+"""What lies this near to a piece in plan shows whether it carries on."""
+
 _ASIDE_M = 0.25
 """Pieces of a line lie no farther aside of each other than a fused point, and their tops differ by half of that."""
+
+_BOTH = 0.5
+"""Share of what carries a piece on that the other epoch shows too: it is the rest of the hedge, and did not pass by."""
+
+_HEDGE_M = 1.5
+"""Hedges are no wider, and vehicles are: one behind another makes no hedge."""
+
+_NEARLY_ALL = 0.8
+"""Share of a rest that lies in its line, from which on it is nothing but the hedge."""
+
+_AS_WIDE = 0.5
+"""Share of the width of a piece that what carries it on has."""
 
 _LINE = 3.0
 """A line is so many times as long as wide."""
