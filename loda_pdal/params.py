@@ -930,9 +930,9 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
         },
         "observability": {"cell_m": 2.0},
         "confidence": {
-            "calibration_unmatched": (-1.07, 3.75),
-            "calibration_changed": (1.58, 0.0),
-            "calibration_unchanged": (-2.37, 5.73),
+            "calibration_unmatched": (1.33, 1.36),
+            "calibration_changed": (1.61, 0.0),
+            "calibration_unchanged": (-1.05, 4.05),
         },
     },
     "paper": {
