@@ -312,7 +312,7 @@ def connected_regions(
     links = cKDTree(place).query_pairs(_LINK_VOXELS, output_type="ndarray")
     region = components(links, len(members))
     groups = Groups(region, int(region.max()) + 1)
-    is_shared = _in_column_of(cells, own, members, owner.after)
+    is_shared = in_column_of(cells, own, members, owner.after)
     found = []
     for index in np.flatnonzero(groups.counts >= least).tolist():
         inside = groups.members(index)
@@ -358,7 +358,7 @@ _HIGHER = 2
 """Voxels by which the house rises above what is built onto it."""
 
 
-def _in_column_of(cells: Cells, owner: IntArray, voxel: Int64Array, other: IntArray) -> BoolArray:
+def in_column_of(cells: Cells, owner: IntArray, voxel: Int64Array, other: IntArray) -> BoolArray:
     """Whether each ``owner`` (k,) has a voxel among the ``other`` (c,) owners in the column of its ``voxel`` (k,)."""
     column = np.repeat(np.arange(len(cells.voxels.columns) - 1), np.diff(cells.voxels.columns))
     n = int(max(owner.max(initial=-1), other.max(initial=-1))) + 1

@@ -17,7 +17,7 @@ from loda_pdal.model.cloud import BoolArray, FloatArray, IntArray
 from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams
 from loda_pdal.stages.cues import Cells, Surface
-from loda_pdal.stages.parts import Region, connected_regions
+from loda_pdal.stages.parts import Region, connected_regions, in_column_of
 
 _NARROWEST = 0.5
 """No front is narrower than this many frontages."""
@@ -88,11 +88,9 @@ def split_houses(
 
 def _bare(cells: Cells) -> Pair[BoolArray]:
     """Voxels (c,) in whose columns that epoch has nothing of the object that the other one has there."""
-    column = np.repeat(np.arange(len(cells.voxels.columns) - 1), np.diff(cells.voxels.columns))
     before, after = cells.owner
-    n = int(max(before.max(initial=-1), after.max(initial=-1))) + 1
-    keys = [np.where(side >= 0, column * n + side, -1 - epoch) for epoch, side in enumerate((before, after))]
-    return Pair(~np.isin(keys[1], keys[0]), ~np.isin(keys[0], keys[1]))
+    every = np.arange(len(before))
+    return Pair(~in_column_of(cells, after, every, before), ~in_column_of(cells, before, every, after))
 
 
 def _fronts(
