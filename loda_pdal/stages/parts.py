@@ -316,9 +316,8 @@ def connected_regions(
     found = []
     for index in np.flatnonzero(groups.counts >= least).tolist():
         inside = groups.members(index)
-        # voxels are sorted: the last one of a column is its highest
-        plan, first = np.unique(cells.voxels.cell[members[inside], :2], axis=0, return_index=True)
-        tops = members[inside][np.append(first[1:], len(inside)) - 1]
+        plan, first, last = ends_of_columns(cells.voxels.cell[members[inside]])
+        tops = members[inside][last]
         is_narrow = width > 0 and width_of(plan) < width
         if is_narrow and (is_clear is None or not _is_low_roof(cells.voxels.cell, owner.before, tops, is_clear)):
             continue
@@ -356,6 +355,12 @@ _CLEAR = 1.0 / 3.0
 
 _HIGHER = 2
 """Voxels by which the house rises above what is built onto it."""
+
+
+def ends_of_columns(cell: Int64Array) -> tuple[Int64Array, Int64Array, Int64Array]:
+    """Columns (k, 2) of the sorted voxels ``cell`` (m, 3), and the lowest and the highest voxel of each (k,)."""
+    plan, first = np.unique(cell[:, :2], axis=0, return_index=True)
+    return plan, first, np.append(first[1:], len(cell)) - 1
 
 
 def in_column_of(cells: Cells, owner: IntArray, voxel: Int64Array, other: IntArray) -> BoolArray:

@@ -17,7 +17,7 @@ from loda_pdal.model.cloud import BoolArray, FloatArray, IntArray
 from loda_pdal.model.pair import Pair
 from loda_pdal.params import ChangeParams
 from loda_pdal.stages.cues import Cells, Surface
-from loda_pdal.stages.parts import Region, connected_regions, in_column_of
+from loda_pdal.stages.parts import Region, connected_regions, ends_of_columns, in_column_of
 
 _NARROWEST = 0.5
 """No front is narrower than this many frontages."""
@@ -72,10 +72,13 @@ def split_houses(
     host : (h,) int32
         The object that each house was part of.
     """
-    n, own, bare = len(is_asked), cells.owner, _bare(cells)
+    n = len(is_asked)
     xyz = np.concatenate([side.xyz for side in surfaces])
     label = np.concatenate([side.owner for side in surfaces])
     is_row = is_asked & (upright_boxes(xyz, label, n).size[:, 0] > params.part_of_length_m)
+    if not is_row.any():
+        return surfaces.map(lambda side: side.owner), np.zeros(0, dtype=np.int32)
+    own, bare = cells.owner, _bare(cells)
     gone = _fronts(cells, own, cells.is_lost & bare.after, is_row, params)
     come = _fronts(cells, own.swapped, cells.is_gained & bare.before, is_row, params)
     near = cells.voxels.at_points(cells.is_near.swapped, surfaces)
@@ -107,12 +110,8 @@ def _fronts(
         foot = float(centre[:, 2].min())
         if np.quantile(centre[:, 2], 0.95) - foot < least:
             continue
-        # voxels are sorted: the last one of a column is its highest
-        _, first, column = np.unique(
-            cells.voxels.cell[region.voxels, :2], axis=0, return_index=True, return_inverse=True
-        )
-        highest = centre[np.append(first[1:], len(centre)) - 1, 2]
-        is_front = (highest - foot >= least)[column.ravel()]
+        _, first, last = ends_of_columns(cells.voxels.cell[region.voxels])
+        is_front = np.repeat(centre[last, 2] - foot >= least, last - first + 1)
         box = upright_boxes(centre, np.where(is_front, 0, -1).astype(np.int32), 1)
         length = float(box.size[0, 0]) + params.voxel_m
         if length <= shortest:
@@ -133,14 +132,13 @@ def _height_of_row(cells: Cells, owner: Pair[IntArray], region: Region, params: 
     first, last = np.searchsorted(cell[:, 0], [along.min() - reach, along.max() + reach + 1])
     is_own = (owner.before[first:last] == region.parent) | (owner.after[first:last] == region.parent)
     own = first + np.flatnonzero(is_own)
-    plan, lowest = np.unique(cell[own, :2], axis=0, return_index=True)
+    plan, lowest, highest = ends_of_columns(cell[own])
     distance, _ = cKDTree(region.columns).query(plan, distance_upper_bound=float(reach))
     is_beside = (distance > _BESIDE) & np.isfinite(distance)
     if np.count_nonzero(is_beside) < _LEAST_BESIDE:
         return 0.0
     z = cells.voxels.centre[own, 2]
-    top = z[np.append(lowest[1:], len(own)) - 1]
-    return float(np.median(top[is_beside]) - np.quantile(z[lowest[is_beside]], 0.1)) + params.voxel_m
+    return float(np.median(z[highest[is_beside]]) - np.quantile(z[lowest[is_beside]], 0.1)) + params.voxel_m
 
 
 def _given(surface: Surface, is_near: BoolArray, fronts: list[_Front], first: int, params: ChangeParams) -> IntArray:

@@ -219,6 +219,8 @@ def carried_on(surfaces: Pair[Surface], is_asked: BoolArray) -> Pair[IntArray]:
     ends = np.array([(line.piece, line.rest) for line in found], dtype=np.int64).reshape(-1, 2)
     is_leafy = roughness(surfaces, np.isin(np.arange(n), ends)) > FOLIAGE_M
     line_of = {line.piece: line for line in found if is_leafy[line.piece] and is_leafy[line.rest]}
+    if not line_of:
+        return surfaces.map(lambda side: side.owner)
     hedges: dict[int, list[_Line]] = {}
     for line in line_of.values():
         hedges.setdefault(line.rest, []).append(line)
