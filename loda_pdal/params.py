@@ -531,6 +531,11 @@ class ChangeParams(StageParams):
         "a voxel is gained or lost only where the other survey has a return beneath it, in its column or beside it: a "
         "wet roof that returned nothing was not taken down",
     )
+    looks_down: bool = param(
+        False,
+        "from the air a place was seen empty only where the other survey has a return beneath it in its column, and no "
+        "roof above it or beside that: walls, porches and shadows are met by oblique strips alone",
+    )
     fair_tops: bool = param(True, "columns' tops are compared as if both epochs had equally many points in them")
     volume_sigmas: float = param(
         0.0, "gained less lost voxels must exceed this many times the root of their sum; 0: need not", low=0, high=100
@@ -628,6 +633,7 @@ class ChangeParams(StageParams):
             query_radius_m=self.body_query_radius_m,
             weighs_sampling=False,
             needs_returns=True,
+            looks_down=False,
         )
 
 
@@ -918,6 +924,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "part_min_width_m": 1.5,
             "plant_width_m": 2.5,
             "needs_sight": False,
+            "looks_down": True,
             "min_returns": 8,
             "within_share": 0.0,
             "plant_rise_m": 0.0,

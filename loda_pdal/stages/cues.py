@@ -335,17 +335,24 @@ def sample_voxels(
     over, clear = Pair(always, always), Pair(never, never)
     if params.fills_buildings:
         clear = surfaces.map(lambda surface: _is_clear(cell, columns, surface, params.voxel_m))
+    z = centre[:, 2]
     if params.needs_sight or params.thing_voxels > 0:
-        over = surfaces.map(lambda surface: _is_over(centre, cell, columns, surface.xyz, params.voxel_m))
+        over = surfaces.map(lambda side: _ends_of_columns(cell, columns, side.xyz, params.voxel_m)[0] < z)
+    measured = surfaces.map(lambda surface: surface.xyz[surface.n_raw > 0])
     if params.needs_returns:
-        measured = surfaces.map(lambda surface: surface.xyz[surface.n_raw > 0])
-        over = measured.map(lambda points: _is_over(centre, cell, columns, points, params.voxel_m, reach=1))
+        over = measured.map(lambda points: _ends_of_columns(cell, columns, points, params.voxel_m, reach=1)[0] < z)
     if coverage:
         shown = coverage.map(lambda side: side.shown(cell, params.voxel_m))
         hidden = shown.map(lambda rays: rays.is_hidden)
         covered = coverage.join(shown, lambda side, rays: rays.corrected(side.at(centre)))
         if params.needs_returns:
             covered = covered.join(over, np.logical_and)
+        if params.looks_down:
+            top = z + params.voxel_m / 2
+            below = measured.map(lambda points: _ends_of_columns(cell, columns, points, params.voxel_m)[0] < top)
+            bodies = surfaces.map(lambda surface: surface.xyz[surface.n_raw == 0])
+            under = bodies.map(lambda points: _ends_of_columns(cell, columns, points, params.voxel_m, reach=1)[1] > top)
+            covered = Pair(*(c & b & ~u for c, b, u in zip(covered, below, under, strict=True)))
         is_open = coverage.swapped.join(xyz, lambda other, points: other.at(points))
         if params.needs_sight:
             shaded = _in_shadow(cell, columns, surfaces, params.voxel_m)
@@ -398,23 +405,23 @@ def cells_with_owners(
     return Cells(voxels, owner, is_seen, n_raw, odds)
 
 
-def _is_over(
-    centre: FloatArray, cell: Int64Array, columns: Int64Array, xyz: FloatArray, voxel_m: float, reach: int = 0
-) -> BoolArray:
-    """Whether any of the points (m, 3) lies beneath the centre of each voxel (c,), in its column or at most ``reach``
-    columns beside it."""
+def _ends_of_columns(
+    cell: Int64Array, columns: Int64Array, xyz: FloatArray, voxel_m: float, reach: int = 0
+) -> tuple[FloatArray, FloatArray]:
+    """Lowest and highest (c,) m of the points (m, 3) in the column of each voxel, or at most ``reach`` columns beside
+    it; infinite, and the other way round, where there is none."""
     first = columns[:-1]
-    if len(first) == 0 or len(xyz) == 0:
-        return np.zeros(len(cell), np.bool_)
-    plan = cell[first, :2]
-    lattice = Lattice.around(plan)
-    keys = lattice.keys(plan)
-    lowest = np.full(len(first), np.inf)
-    place = cells_of(xyz[:, :2], voxel_m)
-    for step in np.ndindex(2 * reach + 1, 2 * reach + 1):
-        column = lattice.find(keys, place + (np.array(step) - reach))
-        lowest = np.fmin(lowest, Groups(column, len(first)).minimum(xyz[:, 2]))
-    return np.asarray(np.repeat(lowest, np.diff(columns)) < centre[:, 2])
+    low, high = np.full(len(first), np.inf), np.full(len(first), -np.inf)
+    if len(first) > 0 and len(xyz) > 0:
+        plan = cell[first, :2]
+        lattice = Lattice.around(plan)
+        keys = lattice.keys(plan)
+        place = cells_of(xyz[:, :2], voxel_m)
+        for step in np.ndindex(2 * reach + 1, 2 * reach + 1):
+            inside = Groups(lattice.find(keys, place + (np.array(step) - reach)), len(first))
+            low, high = np.fmin(low, inside.minimum(xyz[:, 2])), np.fmax(high, inside.maximum(xyz[:, 2]))
+    size = np.diff(columns)
+    return np.repeat(low, size), np.repeat(high, size)
 
 
 def _in_shadow(cell: Int64Array, columns: Int64Array, surfaces: Pair[Surface], voxel_m: float) -> Pair[BoolArray]:
