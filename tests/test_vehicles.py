@@ -62,6 +62,14 @@ def test_another_vehicle_is_told_where_points_suffice(one: Profile, other: Profi
         np.testing.assert_allclose(tops_differ(sides, ASKED), tops_differ(sides.swapped, ASKED))
 
 
+def test_a_post_beside_a_vehicle_makes_it_no_other_one() -> None:
+    random = np.random.default_rng(8)
+    before, after = seen(SALOON, random, 0.4), seen(SALOON, random, 0.4)
+    post = np.column_stack([np.full(4, 5.4), np.zeros(4), np.linspace(0.5, 2.0, 4)])
+    with_post = surface(np.concatenate([before.xyz, post]), np.concatenate([before.owner, np.zeros(4, np.int32)]))
+    assert tops_differ(Pair(with_post, after), ASKED)[0] < ANOTHER
+
+
 def test_what_is_no_whole_vehicle_is_not_compared() -> None:
     random = np.random.default_rng(7)
     whole = seen(SALOON, random, 0.4)
