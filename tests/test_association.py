@@ -195,3 +195,29 @@ def test_what_each_epoch_calls_by_another_name_stays_in_its_place() -> None:
     )
     np.testing.assert_array_equal(found.owner.before, found.owner.after)
     np.testing.assert_array_equal(found.owner.before, which)
+
+
+@pytest.mark.parametrize(("has_sides", "expected"), [(False, ObjectClass.MOBILE), (True, ObjectClass.OTHER)])
+def test_from_the_air_what_either_epoch_calls_a_vehicle_is_one(has_sides: bool, expected: ObjectClass) -> None:
+    """A vehicle of 40 points in the first epoch, a thing of no known kind with 160 points in the second."""
+    sides = Pair(0.5, 0.25).map(
+        lambda step: np.stack(np.meshgrid(np.arange(0, 5, step), np.arange(0, 2, step), [1.0]), axis=-1).reshape(-1, 3)
+    )
+    kinds = Pair(ObjectClass.MOBILE, ObjectClass.OTHER)
+    instances = sides.join(
+        kinds,
+        lambda xyz, kind: Instances(
+            np.ones(len(xyz), np.int32), np.array([kind], dtype=np.uint8), np.full(len(xyz), kind, np.uint8)
+        ),
+    )
+    found = match_instances(
+        sides,
+        instances,
+        sides.join(instances, lambda xyz, side: (xyz, side.instance)),
+        sides.map(lambda xyz: describe(xyz, xyz[:, 2], np.ones(len(xyz), np.int32), 1, 10, 0.5, "upright")),
+        None,
+        0.6,
+        PARAMS,
+        has_sides=has_sides,
+    )
+    assert found.object_class.tolist() == [expected]

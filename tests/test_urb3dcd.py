@@ -17,6 +17,7 @@ from loda_pdal.benchmark.urb3dcd import (
     UrbScene,
     UrbScores,
     classes_of,
+    pieces_only,
     read_scene,
     scene_of_block,
     to_markdown,
@@ -173,6 +174,16 @@ def test_what_is_gone_is_labelled_on_the_ground_that_took_its_place() -> None:
     places = [2.0, 22.0, 42.0, 62.0, 10.0]
     after = known(*((x, 2.0, 0.0, GROUND, UNCHANGED, 0) for x in places), (3.0, 2.0, 2.0, CAR, UNCHANGED, 9))
     assert classes_of(Pair(before, after)).tolist() == [2, 5, 6, 0, 0, 0]
+
+
+def test_the_roof_of_a_house_that_got_an_annex_is_not_new() -> None:
+    before = known(*square(0, 6, BUILDING, INCREASED, 1), *square(5, 0, GROUND, UNCHANGED, 0))
+    after = known(*square(0, 6, BUILDING, INCREASED, 1), *square(5, 3, BUILDING, INCREASED, 2))
+    found = classes_of(pieces_only(Pair(before, after)))
+    assert found.tolist() == [UrbClass.UNCHANGED] * 81 + [UrbClass.NEW_BUILDING] * 81
+    grown = after._replace(object_class=np.full_like(after.object_class, PLANT))
+    assert np.all(classes_of(pieces_only(Pair(before, grown))) == UrbClass.VEGETATION_GROWTH)
+    assert np.all(classes_of(pieces_only(Pair(known(), after))) == UrbClass.NEW_BUILDING)
 
 
 def test_no_points_no_classes() -> None:

@@ -44,7 +44,8 @@ LABEL = "label_ch"
 
 OUTLINE_SPACINGS = 1.5
 MIN_OUTLINE_M = 0.5
-"""What is gone is outlined on cells of so many point spacings, and at least this edge."""
+"""Points of one surface lie no farther apart than so many point spacings, or than this: what is gone is outlined on
+cells of that edge."""
 
 
 class UrbClass(IntEnum):
@@ -232,13 +233,36 @@ def classes_of(known: Pair[Known]) -> ByteArray:
         is_gone = gone == urb_class
         ids, number = np.unique(before.object[is_gone], return_inverse=True)
         xy = before.xyz[is_gone, :2]
-        edge = max(MIN_OUTLINE_M, OUTLINE_SPACINGS * Survey(before.xyz).extent.spacing_m)
-        outlines = footprints(xy, (number + 1).astype(np.int32), len(ids), edge)
+        outlines = footprints(xy, (number + 1).astype(np.int32), len(ids), _cell_m(before.xyz))
         ground = np.flatnonzero((after.object_class == ObjectClass.GROUND) & (classes == UrbClass.UNCHANGED))
         places = shapely.points(after.xyz[ground, :2])
         covered = shapely.STRtree(places).query(np.array(outlines), predicate="contains")[1]
         classes[ground[covered]] = urb_class
     return np.asarray(classes)
+
+
+def pieces_only(known: Pair[Known]) -> Pair[Known]:
+    """What is known, but of buildings that grew or shrank only the points that the other epoch has nothing beside.
+
+    Our label says that a house changed, and a house that got an annex is labelled as a whole; these classes ask whether
+    something changed at a point, and its roof is what it was.
+    """
+
+    def of_epoch(own: Known, other: Known) -> Known:
+        is_partly = np.isin(own.change, (ChangeLabel.INCREASED, ChangeLabel.DECREASED))
+        asked = np.flatnonzero(is_partly & (own.object_class == ObjectClass.BUILDING))
+        change = own.change.copy()
+        if len(asked) and len(other.xyz):
+            apart, _ = cKDTree(other.xyz).query(own.xyz[asked], workers=thread_count())
+            change[asked[apart <= _cell_m(other.xyz)]] = ChangeLabel.UNCHANGED
+        return own._replace(change=change)
+
+    return known.join(known.swapped, of_epoch)
+
+
+def _cell_m(xyz: FloatArray) -> float:
+    """How far apart, m, the points (n, 3) of one surface lie at most, with few exceptions."""
+    return max(MIN_OUTLINE_M, OUTLINE_SPACINGS * Survey(xyz).extent.spacing_m)
 
 
 def run_scenes(
@@ -270,7 +294,7 @@ def _answers(surveys: Pair[Survey], preset: str) -> Iterator[tuple[str, Pair[Kno
     labelled = Pair(moved, surveys.after.xyz).join(result.points, _Labelled)
 
     ours = result.points.map(lambda labels: Marks(labels.change, labels.object.astype(np.int64)))
-    yield OURS, labelled.join(ours, _known)
+    yield OURS, pieces_only(labelled.join(ours, _known))
     scene = scene_of(surveys, parameters)
     for method in (m for m in UNTRAINED if m.is_installed):
         params = TUNED[preset][method.name]

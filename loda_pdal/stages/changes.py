@@ -41,7 +41,7 @@ from loda_pdal.stages.rules import (
     verdict_of,
 )
 from loda_pdal.stages.things import carried_on, split_close_things, split_things
-from loda_pdal.stages.vehicles import ONE_VEHICLE_M, looks_like_vehicle, roughness, shape_change
+from loda_pdal.stages.vehicles import ONE_VEHICLE_M, looks_like_vehicle, roughness, shape_change, tops_differ
 
 
 @dataclass(frozen=True)
@@ -255,8 +255,8 @@ def _is_replaced(
         rise = np.minimum(
             [abs(cue.dh) for cue in cues], np.abs(median_rise(voxels, cast.surfaces, len(cast), _LEAST_TOPS))
         )
-        is_mobile = is_pair & (cast.object_class == ObjectClass.MOBILE)
-        is_another |= is_mobile & np.isnan(off) & (rise > params.replaced_top_m)
+        is_few = is_pair & (cast.object_class == ObjectClass.MOBILE) & np.isnan(off)
+        is_another |= is_few & ((rise > params.replaced_top_m) | (tops_differ(cast.surfaces, is_few) > _SURE))
     return np.asarray(is_another)
 
 
@@ -290,6 +290,9 @@ _LEAST_VEHICLE = 50
 
 _MOST_BENEATH = 0.5
 """Of what is a vehicle no more lies beneath a building: a piece of a wall has more of the house above it."""
+
+_SURE = 1.1
+"""Tops of another vehicle differ more surely, see `tops_differ`."""
 
 _ROUGH = 1.0
 """A shape must be off by more than this many times its own roughness."""

@@ -118,7 +118,7 @@ def match_instances(
         _owners(instances.before, of_instance, votes, apart.after),
         _owners(instances.after, of_instance.swapped, votes.swapped, apart.before),
     )
-    return _numbered(xyz, instances, of_instance, owner, pairs, votes)
+    return _numbered(xyz, instances, of_instance, owner, pairs, votes, has_sides=has_sides)
 
 
 @dataclass(frozen=True)
@@ -244,6 +244,8 @@ def _numbered(
     owner: Pair[IntArray],
     pairs: IntArray,
     votes: Pair[_Votes],
+    *,
+    has_sides: bool,
 ) -> Objects:
     n = max((int(side.max()) + 1 for side in of_instance if len(side)), default=0)
     rank = rank_by_place(xyz, owner, n)
@@ -252,6 +254,9 @@ def _numbered(
     for side, own in zip(of_instance, instances, strict=True):
         voxels = np.bincount(own.instance, minlength=len(own) + 1)[1:]
         np.add.at(votes_per_class, (side, own.object_class), voxels)
+    if not has_sides:  # of a van from above one survey met the bonnet, and to the other it is what is left
+        is_vehicle = votes_per_class[:, ObjectClass.MOBILE] > 0
+        votes_per_class[is_vehicle, ObjectClass.MOBILE] += votes_per_class[is_vehicle, ObjectClass.OTHER]
     priority = np.array(OBJECT_CLASSES, dtype=np.uint8)
     object_class = priority[np.argmax(votes_per_class[:, priority], axis=1)] if n else np.zeros(0, np.uint8)
     owner = owner.map(lambda side: np.append(rank, np.int32(-1))[side])

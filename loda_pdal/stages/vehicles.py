@@ -6,10 +6,12 @@ again, half a metre on. So each is moved and turned until it fits, and what then
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from loda_pdal.kernels.neighbours import nearest
 from loda_pdal.model.boxes import upright_boxes
@@ -99,6 +101,127 @@ def looks_like_vehicle(
         fits &= (width < most_m[0]) & (length < most_m[1])
         fits &= filled > _LEAST_FILL * width * length
     return fits
+
+
+def tops_differ(surfaces: Pair[Surface], is_asked: BoolArray) -> FloatArray:
+    """How surely the tops of vehicles that are seen from above differ, (n,); NaN where not asked for, where one is no
+    whole vehicle, or where too few points tell.
+
+    A few returns have no shape, and the roofs of an estate and a saloon are as high: they differ along a metre of their
+    length. A top counts by how far it lies above or below all that the other epoch shows within a point spacing of it,
+    the ground beside it too. What is higher counts against what is lower, along each metre of the vehicle, over
+    the root of the number of points there, as the sum of what is chance would grow; after the move that leaves least.
+
+    Parameters
+    ----------
+    surfaces : Pair of Surface
+        All points, those of objects with their owners 0 to ``n - 1``.
+    is_asked : (n,) bool
+        Objects that are compared, present in both epochs.
+    """
+    n = len(is_asked)
+    sure = np.full(n, np.nan)
+    is_whole = is_asked.copy()
+    for side in surfaces:
+        tops = side.only((side.n_raw > 0) & np.append(is_asked, False)[side.owner])
+        length, width = upright_boxes(tops.xyz, tops.owner, n).size[:, :2].T
+        is_whole &= (width > _LEAST_M[0]) & (length > np.fmax(_LEAST_M[1], _SLENDER * width))
+        is_whole &= (width < ONE_VEHICLE_M[0]) & (length < ONE_VEHICLE_M[1])
+    if not is_whole.any():
+        return sure
+    measured = surfaces.map(lambda side: np.flatnonzero((side.n_raw > 0) & np.append(is_whole, False)[side.owner]))
+    xyz = surfaces.join(measured, lambda side, top: side.xyz[top])
+    owner = np.concatenate(list(surfaces.join(measured, lambda side, top: side.owner[top])))
+    about = surfaces.map(lambda side: side.xyz[side.n_raw > 0])
+    tree = about.map(lambda points: cKDTree(points[:, :2]))
+    both, groups = np.concatenate(list(xyz))[:, :2], Groups(owner, n)
+    number = tree.map(lambda side: groups.mean(side.query_ball_point(both, _AROUND_M, return_length=True)))
+    spacing = _AROUND_M * np.sqrt(np.pi / np.fmax(np.fmin(*number), 1.0))  # of the sparser epoch
+    reach = _SPACINGS * spacing[owner]
+    boxes = upright_boxes(np.column_stack([both, np.zeros(len(both))]), owner, n)
+    along = np.sum((both - boxes.centre[owner, :2]) * boxes.axes[owner, 0, :2], axis=1)
+    n_before = len(xyz.before)
+    before = _Facing.of(xyz.before, about.after, tree.after, reach[:n_before])
+    after = _Facing.of(xyz.after, about.before, tree.before, reach[n_before:])
+    for move in _MOVES_M:
+        off = np.concatenate([-before.beyond(move), after.beyond(-move)])
+        place = along.copy()
+        place[:n_before] += boxes.axes[owner[:n_before], 0, :2] @ move
+        sure = np.fmin(sure, _along(place, off, owner, n))
+    return sure
+
+
+class _Facing(NamedTuple):
+    """Points (k, 3) m of one epoch, those (m, 3) m of the other one, pairs (p,) of them that are near in plan, and the
+    ``reach`` (k,) m within which they count."""
+
+    xyz: FloatArray
+    other: FloatArray
+    own: IntArray
+    theirs: IntArray
+    reach: FloatArray
+
+    @staticmethod
+    def of(xyz: FloatArray, other: FloatArray, tree: cKDTree, reach: FloatArray) -> _Facing:
+        """All pairs that any move may bring within reach; ``tree`` of the other points in plan."""
+        found = tree.query_ball_point(xyz[:, :2], reach + _FARTHEST_M, return_sorted=True)
+        own = np.repeat(np.arange(len(xyz), dtype=np.int32), [len(ids) for ids in found])
+        return _Facing(xyz, other, own, np.fromiter(itertools.chain(*found), np.int32, len(own)), reach)
+
+    def beyond(self, move: FloatArray) -> FloatArray:
+        """How far each point (k,), after a ``move`` (2,) m, lies above or below (less than 0) all others in its reach,
+        over `_DIFFERS_M` and at most 1; NaN where there are fewer than two."""
+        offset = self.xyz[self.own, :2] + move - self.other[self.theirs, :2]
+        is_in = np.sum(offset**2, axis=1) <= self.reach[self.own] ** 2
+        near = Groups(np.where(is_in, self.own, -1), len(self.xyz))
+        low, high = near.extremes(self.other[self.theirs, 2])
+        z = self.xyz[:, 2]
+        off = np.clip((np.fmax(z - high, 0.0) - np.fmax(low - z, 0.0)) / _DIFFERS_M, -1.0, 1.0)
+        return np.where(near.counts >= 2, off, np.nan)
+
+
+def _along(place: FloatArray, off: FloatArray, owner: IntArray, n: int) -> FloatArray:
+    """The largest sum (n,) of ``off`` (k,) over a metre of each vehicle over the root of the points there; ``place``
+    (k,) m along it. NaN where fewer than `_LEAST_TOPS` points tell."""
+    order = np.lexsort((place, owner))
+    order = order[np.isfinite(off[order])]
+    number, off = owner[order], off[order]
+    place = place[order] + number * _APART_M
+    first = np.searchsorted(place, place - _STRETCH_M / 2)
+    last = np.searchsorted(place, place + _STRETCH_M / 2, side="right")
+    total = np.concatenate([[0.0], np.cumsum(off)])
+    count = last - first
+    surplus = np.where(count >= _LEAST_ALONG, np.abs(total[last] - total[first]) / np.sqrt(count), 0.0)
+    groups = Groups(number, n)
+    return np.where(groups.counts >= _LEAST_TOPS, groups.maximum(surplus), np.nan)
+
+
+_SLENDER = 1.5
+"""Vehicles are more than so many times as long as wide; boxes about a few returns of one are too."""
+
+_AROUND_M = 3.0
+"""The point spacing about a vehicle is that within so wide a circle."""
+
+_SPACINGS = 1.1
+"""Point spacings within which the other epoch shows a few points of the same surface."""
+
+_MOVES_M = 0.1 * np.array([(x, y) for x in range(-2, 3) for y in range(-2, 3)])
+"""Moves (25, 2) in plan that are tried: what is left of the registration, and a slot that was not met the same way."""
+
+_FARTHEST_M = 0.3
+"""No move is longer."""
+
+_DIFFERS_M = 0.3
+"""A top that lies so far beyond all about it counts in full."""
+
+_STRETCH_M = 1.0
+"""Builds differ along so much of their length."""
+
+_LEAST_ALONG = 5
+"""Points along a metre of it that tell: the post beside a vehicle has fewer."""
+
+_LEAST_TOPS = 25
+"""Points of both epochs that tell."""
 
 
 class Aloft(NamedTuple):
