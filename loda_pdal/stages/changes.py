@@ -25,6 +25,7 @@ from loda_pdal.stages.cues import Cells, Evidence, Surface, Voxels, median_rise,
 from loda_pdal.stages.faces import face_offset
 from loda_pdal.stages.observability import Coverage
 from loda_pdal.stages.parts import largest_regions, split_parts
+from loda_pdal.stages.rooflines import beyond_view
 from loda_pdal.stages.rows import split_houses
 from loda_pdal.stages.rules import (
     NEXT_TO_NOTHING,
@@ -121,7 +122,7 @@ def decide_changes(
     """
     seen = coverage if observability.is_enabled or params.visible_only else None
     voxels = sample_voxels(surfaces, seen, lod, params)
-    cast = _divided(surfaces, object_class, voxels, params)
+    cast, voxels = _divided(surfaces, object_class, voxels, params)
     cells = cast.cells(voxels, params)
     evidence = weigh(cells, cast.surfaces, len(cast), params)
     regions = largest_regions(cells, len(cast), params)
@@ -183,8 +184,11 @@ def _without_uncovered(
     return [uncovered(v) if found else v for v, found in zip(verdicts, is_uncovered.tolist(), strict=True)]
 
 
-def _divided(surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, params: ChangeParams) -> Cast:
-    """The objects as they are judged: pairs that are none undone, things and parts taken out (METHOD 2b)."""
+def _divided(
+    surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, params: ChangeParams
+) -> tuple[Cast, Voxels]:
+    """The objects as they are judged: pairs that are none undone, things and parts taken out (METHOD 2b); and the
+    voxels, without the walls that only one survey could see."""
     n = len(object_class)
     no = np.zeros(n, np.bool_)
     cast = Cast(surfaces, object_class, np.full(n, -1, dtype=np.int32), no, no, no).settled(voxels)
@@ -219,12 +223,15 @@ def _divided(surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, p
         cast = cast.with_more(carried_on(cast.surfaces, is_leafy), host[:0]).settled(voxels)
         cells = cast.cells(voxels, params)
     if params.find_parts and params.needs_sight and not params.fills_buildings:
-        is_asked = cast.is_pair & (cast.object_class == ObjectClass.BUILDING) & (params.frontage_m > 0)
+        is_asked = cast.is_pair & (cast.object_class == ObjectClass.BUILDING)
+        voxels = voxels.unseen_by(beyond_view(cells, cast.surfaces, is_asked, params))
+        cells = cast.cells(voxels, params)
+        is_asked &= params.frontage_m > 0
         cast = cast.with_more(*split_houses(cells, cast.surfaces, is_asked, params)).settled(voxels)
         cells = cast.cells(voxels, params)
     if params.find_parts:
         cast = cast.with_parts(split_parts(cells, cast.surfaces, cast.object_class, params)).settled(voxels)
-    return cast
+    return cast, voxels
 
 
 def _with_close_things(cast: Cast, voxels: Voxels, cells: Cells, params: ChangeParams) -> Cast:

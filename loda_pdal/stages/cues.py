@@ -129,6 +129,10 @@ class Voxels:
         steps = np.concatenate([np.eye(3, dtype=np.int64), -np.eye(3, dtype=np.int64)])
         return np.column_stack([lattice.find(keys, self.cell + step) for step in steps])
 
+    def unseen_by(self, is_beyond: Pair[BoolArray]) -> Voxels:
+        """The same voxels, those marked (c,) not seen by that epoch."""
+        return replace(self, is_covered=self.is_covered.join(is_beyond, lambda seen, beyond: seen & ~beyond))
+
     def holders(self, surfaces: Pair[Surface], n: int) -> tuple[IntArray, FloatArray]:
         """Object (c, 2) that has each voxel before and after, -1 none, and its raw points (c, 2) in there.
 
