@@ -138,10 +138,12 @@ def decide_changes(
     is_shed = slopes_from_walls(cells, cast.surfaces, cast.parent, is_asked) > _FALLS
     is_screen = is_shed | screens(cells, is_building, is_asked)
     for i in np.flatnonzero(cast.is_extension).tolist():
-        why = "its roof falls towards the wall behind it" if is_shed[i] else "the wall behind it shows as before"
-        verdicts[i] = of_its_own(verdicts[i], why) if is_screen[i] else extension(verdicts[i])
+        verdicts[i] = extension(verdicts[i])
     if params.needs_sight:
         verdicts = _without_uncovered(verdicts, cells, is_building, evidence.n_voxels)
+    for i in np.flatnonzero(is_screen).tolist():
+        why = "its roof falls towards the wall behind it" if is_shed[i] else "the wall behind it shows as before"
+        verdicts[i] = of_its_own(verdicts[i], why)
     raw = np.array(
         [
             raw_score(cue, v, apart, params, confidence)
@@ -149,6 +151,7 @@ def decide_changes(
         ]
     )
     is_of_house = np.append(cast.is_house, False)[cast.parent] & cast.is_extension & ~is_screen
+    is_of_house &= (evidence.observability >= _WELL_SEEN) | (not has_walls)
     is_on_top = (np.fmax(*regions) > 0) & has_walls
     is_built_on = are_built_on(cells, cast.surfaces, cast.parent, is_of_house, is_on_top, has_walls=has_walls)
     for i, part in changed_houses(verdicts, cast.parent, is_built_on, evidence.dv).items():
@@ -285,6 +288,9 @@ def _stands_aside(cast: Cast, cues: list[Cue], is_asked: BoolArray, params: Chan
 
 _FALLS = 0.1
 """Slope of a roof, m per m, that is meant: what is level as built is measured within less."""
+
+_WELL_SEEN = 0.55
+"""Share of a part that both surveys must have seen before a whole house is called after it."""
 
 _LINE_M = 1.5
 """Hedges, fences and walls are narrower, and vehicles, sheds and skips are wider."""
