@@ -171,7 +171,8 @@ def came_into_sight(cells: Cells, is_grown: Pair[BoolArray], is_gone: Pair[BoolA
         is_beside = np.bincount(place.ravel(), weights=beside >= 0, minlength=len(level)) > 0
         owner = level[:, 0]
         is_hidden = np.bincount(owner, weights=is_beside, minlength=n) > _MOST_LEVELS * np.bincount(owner, minlength=n)
-        found |= is_hidden & (Groups(own, n).maximum(z) >= high)
+        begin, end = Groups(own, n).extremes(z)
+        found |= is_hidden & (end >= high) & (end - begin >= _LEAST_HEIGHT_M)
     return found
 
 
@@ -241,6 +242,9 @@ _MOST_LEVELS = 0.5
 
 _AS_HIGH = 0.65
 """It reaches at least this share of the height of what hid it; an annex beside that does not."""
+
+_LEAST_HEIGHT_M = 3.5
+"""And it is higher than an annex."""
 
 _FOOT_M = 0.8
 """What stands on the ground begins no higher above it."""
