@@ -125,14 +125,15 @@ def decide_changes(
     cast, voxels = _divided(surfaces, object_class, voxels, params)
     cells = cast.cells(voxels, params)
     evidence = weigh(cells, cast.surfaces, len(cast), params)
-    regions = largest_regions(cells, len(cast), params)
+    has_walls = not params.fills_buildings
+    is_row = has_walls & (cast.parent < 0) & ~cast.is_house  # a piece of it is too little of it: parts were taken out
+    regions = largest_regions(cells, len(cast), params).map(lambda volume: np.where(is_row, 0.0, volume))
     cues = cues_of(evidence, cast.object_class, regions)
     is_part = (cast.parent >= 0) & ~cast.is_extension
     verdicts = [
         verdict_of(cue, apart, part, params, observability)
         for cue, apart, part in zip(cues, cast.is_apart.tolist(), is_part.tolist(), strict=True)
     ]
-    has_walls = not params.fills_buildings
     is_building = cast.object_class == ObjectClass.BUILDING
     is_asked = cast.is_extension & has_walls
     is_shed = slopes_from_walls(cells, cast.surfaces, cast.parent, is_asked) > _FALLS
