@@ -138,7 +138,7 @@ def screens(cells: Cells, is_wall: BoolArray, is_asked: BoolArray) -> BoolArray:
 def came_into_sight(cells: Cells, is_grown: Pair[BoolArray], is_gone: Pair[BoolArray]) -> BoolArray:
     """Which walls (n,) show in one epoch alone because the building that hid them stands in the other alone.
 
-    A party wall is seen once the house beside it is gone: it begins where that stood, all the way up.
+    A party wall is seen once the house beside it is gone: it begins where that stood, all the way up, and is as high.
 
     Parameters
     ----------
@@ -150,6 +150,7 @@ def came_into_sight(cells: Cells, is_grown: Pair[BoolArray], is_gone: Pair[BoolA
         Buildings that only the before, or only the after epoch has.
     """
     voxels, n = cells.voxels, len(is_grown.before)
+    z = voxels.centre[:, 2]
     found = np.zeros(n, np.bool_)
     for own, is_new, grown, other, gone in (
         (cells.owner.before, cells.is_lost, is_grown.before, cells.owner.after, is_gone.after),
@@ -160,11 +161,18 @@ def came_into_sight(cells: Cells, is_grown: Pair[BoolArray], is_gone: Pair[BoolA
         if len(asked) == 0 or len(hiding) == 0:
             continue
         beside, _ = nearest(voxels.centre[hiding], voxels.centre[asked], _BESIDE_M)
+        foot, top = Groups(other[hiding], n).extremes(z[hiding])
+        is_met = beside >= 0
+        by = other[hiding[beside[is_met]]]
+        high = np.full(n, -np.inf)
+        np.maximum.at(high, own[asked[is_met]], foot[by] + _AS_HIGH * (top[by] - foot[by]))
         levels = np.column_stack([own[asked], voxels.cell[asked, 2]]).astype(np.int64)
         level, place = np.unique(levels, axis=0, return_inverse=True)
         is_beside = np.bincount(place.ravel(), weights=beside >= 0, minlength=len(level)) > 0
         owner = level[:, 0]
-        found |= np.bincount(owner, weights=is_beside, minlength=n) > _MOST_LEVELS * np.bincount(owner, minlength=n)
+        is_hidden = np.bincount(owner, weights=is_beside, minlength=n) > _MOST_LEVELS * np.bincount(owner, minlength=n)
+        begin, end = Groups(own, n).extremes(z)
+        found |= is_hidden & (end >= high) & (end - begin >= _LEAST_HEIGHT_M)
     return found
 
 
@@ -231,6 +239,12 @@ _BESIDE_M = 1.5
 
 _MOST_LEVELS = 0.5
 """Share of its levels at which it does."""
+
+_AS_HIGH = 0.65
+"""It reaches at least this share of the height of what hid it; an annex beside that does not."""
+
+_LEAST_HEIGHT_M = 3.5
+"""And it is higher than an annex."""
 
 _FOOT_M = 0.8
 """What stands on the ground begins no higher above it."""

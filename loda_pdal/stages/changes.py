@@ -25,6 +25,7 @@ from loda_pdal.stages.cues import Cells, Evidence, Surface, Voxels, median_rise,
 from loda_pdal.stages.faces import face_offset
 from loda_pdal.stages.observability import Coverage
 from loda_pdal.stages.parts import largest_regions, split_parts
+from loda_pdal.stages.rooflines import beyond_view
 from loda_pdal.stages.rows import split_houses
 from loda_pdal.stages.rules import (
     NEXT_TO_NOTHING,
@@ -121,26 +122,29 @@ def decide_changes(
     """
     seen = coverage if observability.is_enabled or params.visible_only else None
     voxels = sample_voxels(surfaces, seen, lod, params)
-    cast = _divided(surfaces, object_class, voxels, params)
+    cast, voxels = _divided(surfaces, object_class, voxels, params)
     cells = cast.cells(voxels, params)
     evidence = weigh(cells, cast.surfaces, len(cast), params)
-    regions = largest_regions(cells, len(cast), params)
+    has_walls = not params.fills_buildings
+    is_row = has_walls & (cast.parent < 0) & ~cast.is_house  # a piece of it is too little of it: parts were taken out
+    regions = largest_regions(cells, len(cast), params).map(lambda volume: np.where(is_row, 0.0, volume))
     cues = cues_of(evidence, cast.object_class, regions)
     is_part = (cast.parent >= 0) & ~cast.is_extension
     verdicts = [
         verdict_of(cue, apart, part, params, observability)
         for cue, apart, part in zip(cues, cast.is_apart.tolist(), is_part.tolist(), strict=True)
     ]
-    has_walls = not params.fills_buildings
     is_building = cast.object_class == ObjectClass.BUILDING
     is_asked = cast.is_extension & has_walls
     is_shed = slopes_from_walls(cells, cast.surfaces, cast.parent, is_asked) > _FALLS
     is_screen = is_shed | screens(cells, is_building, is_asked)
     for i in np.flatnonzero(cast.is_extension).tolist():
-        why = "its roof falls towards the wall behind it" if is_shed[i] else "the wall behind it shows as before"
-        verdicts[i] = of_its_own(verdicts[i], why) if is_screen[i] else extension(verdicts[i])
+        verdicts[i] = extension(verdicts[i])
     if params.needs_sight:
         verdicts = _without_uncovered(verdicts, cells, is_building, evidence.n_voxels)
+    for i in np.flatnonzero(is_screen).tolist():
+        why = "its roof falls towards the wall behind it" if is_shed[i] else "the wall behind it shows as before"
+        verdicts[i] = of_its_own(verdicts[i], why)
     raw = np.array(
         [
             raw_score(cue, v, apart, params, confidence)
@@ -148,6 +152,7 @@ def decide_changes(
         ]
     )
     is_of_house = np.append(cast.is_house, False)[cast.parent] & cast.is_extension & ~is_screen
+    is_of_house &= (evidence.observability >= _WELL_SEEN) | (not has_walls)
     is_on_top = (np.fmax(*regions) > 0) & has_walls
     is_built_on = are_built_on(cells, cast.surfaces, cast.parent, is_of_house, is_on_top, has_walls=has_walls)
     for i, part in changed_houses(verdicts, cast.parent, is_built_on, evidence.dv).items():
@@ -183,8 +188,11 @@ def _without_uncovered(
     return [uncovered(v) if found else v for v, found in zip(verdicts, is_uncovered.tolist(), strict=True)]
 
 
-def _divided(surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, params: ChangeParams) -> Cast:
-    """The objects as they are judged: pairs that are none undone, things and parts taken out (METHOD 2b)."""
+def _divided(
+    surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, params: ChangeParams
+) -> tuple[Cast, Voxels]:
+    """The objects as they are judged: pairs that are none undone, things and parts taken out (METHOD 2b); and the
+    voxels, without the walls that only one survey could see."""
     n = len(object_class)
     no = np.zeros(n, np.bool_)
     cast = Cast(surfaces, object_class, np.full(n, -1, dtype=np.int32), no, no, no).settled(voxels)
@@ -219,12 +227,15 @@ def _divided(surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, p
         cast = cast.with_more(carried_on(cast.surfaces, is_leafy), host[:0]).settled(voxels)
         cells = cast.cells(voxels, params)
     if params.find_parts and params.needs_sight and not params.fills_buildings:
-        is_asked = cast.is_pair & (cast.object_class == ObjectClass.BUILDING) & (params.frontage_m > 0)
+        is_asked = cast.is_pair & (cast.object_class == ObjectClass.BUILDING)
+        voxels = voxels.unseen_by(beyond_view(cells, cast.surfaces, is_asked, params))
+        cells = cast.cells(voxels, params)
+        is_asked &= params.frontage_m > 0
         cast = cast.with_more(*split_houses(cells, cast.surfaces, is_asked, params)).settled(voxels)
         cells = cast.cells(voxels, params)
     if params.find_parts:
         cast = cast.with_parts(split_parts(cells, cast.surfaces, cast.object_class, params)).settled(voxels)
-    return cast
+    return cast, voxels
 
 
 def _with_close_things(cast: Cast, voxels: Voxels, cells: Cells, params: ChangeParams) -> Cast:
@@ -278,6 +289,9 @@ def _stands_aside(cast: Cast, cues: list[Cue], is_asked: BoolArray, params: Chan
 
 _FALLS = 0.1
 """Slope of a roof, m per m, that is meant: what is level as built is measured within less."""
+
+_WELL_SEEN = 0.55
+"""Share of a part that both surveys must have seen before a whole house is called after it."""
 
 _LINE_M = 1.5
 """Hedges, fences and walls are narrower, and vehicles, sheds and skips are wider."""

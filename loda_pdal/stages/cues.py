@@ -129,6 +129,18 @@ class Voxels:
         steps = np.concatenate([np.eye(3, dtype=np.int64), -np.eye(3, dtype=np.int64)])
         return np.column_stack([lattice.find(keys, self.cell + step) for step in steps])
 
+    def unseen_by(self, is_beyond: Pair[BoolArray]) -> Voxels:
+        """The same voxels, those marked (c,) not seen by that epoch, and the tops of their columns not compared."""
+        is_either = is_beyond.before | is_beyond.after
+        if not is_either.any():
+            return self
+        is_column = np.repeat(np.logical_or.reduceat(is_either, self.columns[:-1]), np.diff(self.columns))
+        return replace(
+            self,
+            is_covered=self.is_covered.join(is_beyond, lambda seen, beyond: seen & ~beyond),
+            is_open=self.is_open & ~np.repeat(np.repeat(is_column, 2), np.diff(self.starts)),
+        )
+
     def holders(self, surfaces: Pair[Surface], n: int) -> tuple[IntArray, FloatArray]:
         """Object (c, 2) that has each voxel before and after, -1 none, and its raw points (c, 2) in there.
 
