@@ -35,10 +35,9 @@ def param(
     high: float | None = None,
     choices: tuple[str, ...] = (),
     is_length: bool = False,
-    is_area: bool = False,
 ) -> Any:
-    """A dataclass field with its documentation and range; `is_length` and `is_area` mark sizes of neighbourhoods,
-    which grow with the point spacing (see `Parameters.for_spacing`)."""
+    """A dataclass field with its documentation and range; `is_length` marks neighbourhood sizes that grow with the
+    point spacing (see `Parameters.for_spacing`)."""
     metadata = {
         "doc": doc,
         "unit": unit,
@@ -46,7 +45,7 @@ def param(
         "low": low,
         "high": high,
         "choices": choices,
-        "dimension": 1 if is_length else 2 if is_area else 0,
+        "is_length": is_length,
     }
     return field(default=default, metadata=metadata)
 
@@ -645,7 +644,7 @@ class GroundChangeParams(StageParams):
     cell_m: float = param(2.0, "edge of a raster tile", unit="m", low=0.5, high=50, is_length=True)
     min_dz_m: float = param(0.15, "smallest elevation change", unit="m", low=0, high=10)
     lod_factor: float = param(1.1, "the change must exceed this many LoD95", low=0, high=10)
-    min_area_m2: float = param(12.0, "connected area that is reported", unit="m2", low=0, high=100000, is_area=True)
+    min_area_m2: float = param(12.0, "connected area that is reported", unit="m2", low=0, high=100000)
     has_own_limit: bool = param(True, "a tile's limit is its own where the LoD grid has none so small")
 
 
@@ -846,9 +845,7 @@ class Parameters:
         for stage in STAGES:
             values = getattr(self, stage)
             scaled[stage] = {
-                f.name: _scaled(getattr(values, f.name), factor ** f.metadata["dimension"])
-                for f in fields(values)
-                if f.metadata["dimension"] > 0
+                f.name: _scaled(getattr(values, f.name), factor) for f in fields(values) if f.metadata["is_length"]
             }
         return self.with_values(scaled, where=f"{self.name} at {spacing_m:.2f} m point spacing")
 

@@ -61,6 +61,14 @@ def test_fill_of_9_m2_is_too_small() -> None:
     assert set(found.label) == {ChangeLabel.UNCHANGED}
 
 
+def test_a_single_tile_of_a_sparse_survey_is_no_region() -> None:
+    before, after = _ground(1, spacing_m=1.0), _ground(2, spacing_m=1.0)
+    params = replace(PARAMS.ground_changes, cell_m=8.0, min_dz_m=0.1)
+    for width, n in ((8.0, 0), (16.0, 1)):
+        raised = _raised(after, (16.0, 16.0), (16.0 + width, 24.0), 0.6)
+        assert len(_changes(Pair(before, raised), params).regions) == n
+
+
 def test_steep_slope_seen_in_different_places_is_no_change() -> None:
     before, after = _ground(1, slope=0.3), _ground(2, slope=0.3, spacing_m=0.4)
     before = before[(before[:, 0] % 2 < 1.2) | (before[:, 1] > 20)]  # the lower part of every tile only

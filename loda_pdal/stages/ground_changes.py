@@ -25,6 +25,9 @@ SPOTS_PER_TILE = 4
 MIN_SPOTS = 3
 """Fewer spots seen by both epochs leave a tile undetermined."""
 
+MIN_TILES = 2
+"""One tile alone is no region, however large tiles are: of thousands, a few exceed their limit by chance."""
+
 
 @dataclass(frozen=True)
 class GroundRegion:
@@ -177,9 +180,9 @@ def _regions(tiles: Int64Array, sign: FloatArray, params: GroundChangeParams) ->
     region = np.full(len(tiles), -1, np.int64)
     for part, direction in enumerate((1.0, -1.0)):
         labels, _ = ndimage.label(raster == direction, np.ones((3, 3)))
-        area = np.bincount(labels.ravel()) * params.cell_m**2
+        size = np.bincount(labels.ravel())
         own = labels[i, j]
-        is_large = (own > 0) & (area[own] > params.min_area_m2)
+        is_large = (own > 0) & (size[own] * params.cell_m**2 > params.min_area_m2) & (size[own] >= MIN_TILES)
         region = np.where(is_large, 2 * own + part, region)
     return consecutive(region)[0]
 
