@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from loda_pdal.kernels.clusters import linked
-from loda_pdal.kernels.neighbours import mean_distances
+from loda_pdal.kernels.neighbours import mean_distances, nearest
 from loda_pdal.model.cloud import BoolArray, FloatArray, VoxelCloud
+from loda_pdal.model.groups import Groups
 from loda_pdal.params import OutlierParams
 
 
@@ -29,7 +30,8 @@ def find_outliers(xyz: FloatArray, params: OutlierParams) -> BoolArray:
     """Points whose mean distance to their k nearest neighbours exceeds mean + multiplier * standard deviation.
 
     The neighbours of a thin pole lie along one line, and a wall far from the scanner is sampled thinly: with
-    ``keep_voxels``, what hangs together stays.
+    ``keep_voxels``, what hangs together stays, over wider gaps where little but such points is near: crowns at the far
+    end of a street.
 
     Parameters
     ----------
@@ -47,10 +49,27 @@ def find_outliers(xyz: FloatArray, params: OutlierParams) -> BoolArray:
     ascending = np.sort(distance)
     is_outlier = np.asarray(distance > ascending.mean() + params.std_multiplier * ascending.std(ddof=1))
     if params.keep_voxels > 0:
-        lonely = np.flatnonzero(is_outlier)
-        cluster = linked(xyz[lonely], params.keep_gap_m)
-        is_outlier[lonely] = np.bincount(cluster, minlength=len(lonely))[cluster] < params.keep_voxels
+        lonely, dense = np.flatnonzero(is_outlier), np.flatnonzero(~is_outlier)
+        is_kept = _of_large_clusters(xyz[lonely], params.keep_gap_m, params.keep_voxels)
+        if params.thin_gap_m > params.keep_gap_m:
+            is_apart = nearest(xyz[dense], xyz[lonely], params.thin_gap_m)[0] < 0
+            is_kept |= _of_large_clusters(xyz[lonely], params.thin_gap_m, params.keep_voxels, is_apart)
+        is_outlier[lonely[is_kept]] = False
     return is_outlier
+
+
+def _of_large_clusters(xyz: FloatArray, gap_m: float, least: int, is_apart: BoolArray | None = None) -> BoolArray:
+    """Which points (k, 3) hang together in clusters of at least so many; of these most must be apart, if that is
+    said."""
+    cluster = Groups(linked(xyz, gap_m), len(xyz))
+    is_kept = cluster.counts >= least
+    if is_apart is not None:
+        is_kept &= cluster.share(is_apart) > _MOST_APART
+    return np.asarray(is_kept[cluster.labels])
+
+
+_MOST_APART = 0.2
+"""Share of a thinly sampled thing that lies apart from all that is sampled densely."""
 
 
 def mean_neighbour_distance(xyz: FloatArray, k: int) -> FloatArray:

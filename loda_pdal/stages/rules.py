@@ -23,6 +23,8 @@ class Cue(NamedTuple):
     is_after: bool
     support_before: float
     support_after: float
+    due_before: float
+    due_after: float
     gained: float
     lost: float
     iou: float
@@ -66,7 +68,9 @@ def cues_of(evidence: Evidence, object_class: ByteArray, regions: Pair[FloatArra
         evidence.n_voxels.after > 0,
         evidence.support.before,
         evidence.support.after,
-        *(getattr(evidence, name) for name in Cue._fields[5:-6]),
+        evidence.due.before,
+        evidence.due.after,
+        *(getattr(evidence, name) for name in Cue._fields[7:-6]),
         np.fmax(evidence.n_voxels.before, evidence.n_voxels.after),
         *evidence.volume,
         *regions,
@@ -192,8 +196,14 @@ _WITHIN_REACH = 0.4
 def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: ObservabilityParams) -> Verdict:
     """Objects of one epoch only: not seen, seen under another name, or really Added or Removed."""
     label, other = (ChangeLabel.ADDED, "before") if cue.is_after else (ChangeLabel.REMOVED, "after")
-    support = cue.support_after if cue.is_after else cue.support_before
+    support, due = (cue.support_after, cue.due_after) if cue.is_after else (cue.support_before, cue.due_before)
     if observability.is_enabled and cue.observability < observability.min_observability:
+        is_plant = cue.object_class == ObjectClass.VEGETATION
+        if is_plant and support * cue.n_voxels >= params.backing_voxels and support >= params.min_support * due:
+            return Verdict(
+                ChangeLabel.UNCHANGED,
+                f"{support:.0%} of it is in the {other} survey too, whose sampling lets {due:.0%} be expected",
+            )
         return Verdict(
             ChangeLabel.UNDETERMINED,
             f"the {other} survey could have seen only {cue.observability:.0%} of it "
