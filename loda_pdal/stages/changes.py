@@ -42,7 +42,7 @@ from loda_pdal.stages.rules import (
 )
 from loda_pdal.stages.stems import split_poles
 from loda_pdal.stages.things import carried_on, split_close_things, split_things
-from loda_pdal.stages.vehicles import ONE_VEHICLE_M, looks_like_vehicle, roughness, shape_change
+from loda_pdal.stages.vehicles import ONE_VEHICLE_M, Fit, looks_like_vehicle, roughness, shape_change
 
 
 @dataclass(frozen=True)
@@ -237,11 +237,8 @@ def _divided(
 def _with_poles(cast: Cast, cells: Cells, params: ChangeParams) -> Cast:
     """The objects with poles taken out of the foliage on them, where some of that may have changed."""
     n = len(cast)
-    either = [
-        np.bincount(own[is_new], minlength=n)
-        for own, is_new in ((cells.owner.before, cells.is_lost), (cells.owner.after, cells.is_gained))
-    ]
-    is_asked = cast.is_pair & (either[0] + either[1] >= params.backing_voxels)
+    new = np.concatenate([cells.owner.before[cells.is_lost], cells.owner.after[cells.is_gained]])
+    is_asked = cast.is_pair & (np.bincount(new, minlength=n) >= params.backing_voxels)
     is_plant, is_other = (is_asked & (cast.object_class == c) for c in (ObjectClass.VEGETATION, ObjectClass.OTHER))
     more = cast.with_more(*split_poles(cast.surfaces, is_plant, is_other))
     is_pole = np.arange(len(more)) >= n
@@ -266,26 +263,17 @@ def _is_replaced(
     is_pair = np.array([cue.is_before and cue.is_after for cue in cues], dtype=np.bool_)
     is_loose = np.isin(cast.object_class, (ObjectClass.MOBILE, ObjectClass.OTHER)) & is_pair & (params.replaced_m > 0)
     is_vehicle = looks_like_vehicle(cast.surfaces, len(cast))
-    faces = face_offset(cast.surfaces, is_loose)
-    is_another = _stands_aside(cast, cells, faces, is_loose & ~is_vehicle, lod, params)
     is_large = np.array([cue.n_voxels >= _LEAST_VEHICLE for cue in cues], dtype=np.bool_)
-    is_asked = is_loose & is_vehicle & is_large
-    off, move = shape_change(cast.surfaces, is_open, is_asked)
-    rough = roughness(cast.surfaces, is_asked)
-    # what is no vehicle does not move, and what has its faces where they were is the same
-    is_fixed = (cast.object_class == ObjectClass.OTHER) & (faces < params.replaced_m / 2)
-    is_shaped = (off > np.fmax(params.replaced_m, _ROUGH * rough)) & ~is_fixed
-    is_taller = np.abs(move[:, 2]) > np.fmax(
-        _SPRINGS_M, _shared_limit(cells, is_asked, np.array([0.0, 0.0, 1.0]), lod, params)
-    )
-    is_taller &= np.hypot(move[:, 0], move[:, 1]) > _PARKED_M
-    is_another |= (is_shaped | is_taller) & (rough < FOLIAGE_M)
+    aside = face_offset(cast.surfaces, is_loose)
+    fit = shape_change(cast.surfaces, is_open, is_loose & is_vehicle & is_large)
+    is_another = _stands_aside(cast, cells, aside, is_loose & ~is_vehicle, lod, params)
+    is_another |= _has_another_shape(cast, cells, aside, fit, lod, params)
     if params.replaced_top_m > 0:
         rise = np.minimum(
             [abs(cue.dh) for cue in cues], np.abs(median_rise(cells.voxels, cast.surfaces, len(cast), _LEAST_TOPS))
         )
         is_mobile = is_pair & (cast.object_class == ObjectClass.MOBILE)
-        is_another |= is_mobile & np.isnan(off) & (rise > params.replaced_top_m)
+        is_another |= is_mobile & np.isnan(fit.off) & (rise > params.replaced_top_m)
     return np.asarray(is_another)
 
 
@@ -305,10 +293,27 @@ def _stands_aside(
     return is_off & (roughness(cast.surfaces, is_off) < FOLIAGE_M)
 
 
+def _has_another_shape(
+    cast: Cast, cells: Cells, aside: FloatArray, fit: Fit, lod: LodGrid, params: ChangeParams
+) -> BoolArray:
+    """Which of the vehicles that were compared have another shape, or stand higher or lower and not where they stood.
+
+    What is no vehicle stays where it is: its faces lie ``aside`` (n,) m if it is another one.
+    """
+    is_asked = np.isfinite(fit.off)
+    rough = roughness(cast.surfaces, is_asked)
+    is_fixed = (cast.object_class == ObjectClass.OTHER) & (aside < params.replaced_m / 2)
+    is_off = (fit.off > np.fmax(params.replaced_m, _ROUGH * rough)) & ~is_fixed
+    limit = _shared_limit(cells, is_asked, np.array([0.0, 0.0, 1.0]), lod, params)
+    is_lifted = np.abs(fit.move[:, 2]) > np.fmax(_SPRINGS_M, limit)
+    is_elsewhere = np.hypot(fit.move[:, 0], fit.move[:, 1]) > _PARKED_M
+    return np.asarray((is_off | (is_lifted & is_elsewhere)) & (rough < FOLIAGE_M))
+
+
 def _shared_limit(
     cells: Cells, is_asked: BoolArray, normal: FloatArray, lod: LodGrid, params: ChangeParams
 ) -> FloatArray:
-    """What objects (n,) must move, m, along the normals (c, 3) of their voxels, or one for all; NaN where not asked for.
+    """What objects (n,) must move, m, along the normals (c, 3) of their voxels, or one for all; NaN if not asked for.
 
     The noise of their points averages out of a median over all of them; pose and drift, which they share, do not.
     """

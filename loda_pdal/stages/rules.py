@@ -197,8 +197,8 @@ def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: Ob
     """Objects of one epoch only: not seen, seen under another name, or really Added or Removed."""
     label, other = (ChangeLabel.ADDED, "before") if cue.is_after else (ChangeLabel.REMOVED, "after")
     support, due = (cue.support_after, cue.due_after) if cue.is_after else (cue.support_before, cue.due_before)
+    is_plant = cue.object_class == ObjectClass.VEGETATION
     if observability.is_enabled and cue.observability < observability.min_observability:
-        is_plant = cue.object_class == ObjectClass.VEGETATION
         if is_plant and support * cue.n_voxels >= params.backing_voxels and support >= params.min_support * due:
             return Verdict(
                 ChangeLabel.UNCHANGED,
@@ -215,7 +215,10 @@ def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: Ob
             label, f"what the {other} survey shows there is another object; it shares {support:.0%} of the surface"
         )
     is_hidden = params.needs_sight and cue.observability - support < _LEAST_EMPTY
-    if support >= params.min_support * (cue.observability if is_hidden else 1.0):
+    least = params.min_support * (cue.observability if is_hidden else 1.0)
+    if params.needs_sight and is_plant and not is_hidden:
+        least = max(least, _BESIDE_OTHERS * cue.observability)
+    if support >= least:
         return Verdict(
             ChangeLabel.UNCHANGED,
             f"{support:.0%} of its surface is in the {other} survey too, as part of other objects",
@@ -242,6 +245,10 @@ def _hidden(cue: Cue) -> str:
 
 _LEAST_EMPTY = 0.2
 """Share of an object that the other survey must have seen empty, where it shows half of what it could see of it."""
+
+
+_BESIDE_OTHERS = 2 / 3
+"""Share of what the other survey could see of a plant that it must show: half may be within reach of its neighbours."""
 
 
 def _mobile(cue: Cue, params: ChangeParams) -> Verdict:

@@ -1,4 +1,4 @@
-"""Poles among twigs: what stands upright and thin in both epochs, taken out of the foliage that hangs on it (METHOD 2b).
+"""Poles among twigs: what stands upright and thin in both epochs, out of the foliage that hangs on it (METHOD 2b).
 
 A lamp post in a crown is one object with the tree, and where the tree grows the post has grown; a pole from which the
 twigs of a tree hung that was felled has shrunk. But the ground floor of a street has no foliage: there each stem shows
@@ -11,7 +11,7 @@ import numpy as np
 
 from loda_pdal.kernels.clusters import linked
 from loda_pdal.kernels.neighbours import nearest
-from loda_pdal.model.cloud import BoolArray, FloatArray, IntArray
+from loda_pdal.model.cloud import BoolArray, FloatArray, Int64Array, IntArray
 from loda_pdal.model.groups import Groups, consecutive
 from loda_pdal.model.pair import Pair
 from loda_pdal.stages.cues import Surface
@@ -32,7 +32,10 @@ _LEAST_POINTS = 4
 """Fused points of a stem there."""
 
 _PLACE_M = 0.25
-"""Stems of two epochs this near in plan are one; and what lies so near above it, in plan, belongs to it."""
+"""Stems of two epochs this near in plan are one."""
+
+_REACH_M = 0.35
+"""What lies this near to the middle of a pole, in plan, belongs to it, however high."""
 
 _CROWN_M = 3.0
 """What is higher tells which stem a tree has."""
@@ -57,33 +60,29 @@ def split_poles(surfaces: Pair[Surface], is_plant: BoolArray, is_other: BoolArra
         The object that each pole was part of.
     """
     n = len(is_plant)
-    is_asked = is_plant | is_other
-    before, after = surfaces.map(lambda side: _stems(side, is_asked))
     owner = surfaces.map(lambda side: side.owner)
-    found, _ = nearest(after, before, _PLACE_M)
-    back, _ = nearest(before, after, _PLACE_M)
-    pairs = np.flatnonzero(found >= 0)
-    pairs = pairs[back[found[pairs]] == pairs]  # one stem of either epoch each
-    place, host = (before[pairs] + after[found[pairs]]) / 2, (before[pairs, 2] / _LIFT_M).round().astype(np.int32)
+    before, after = surfaces.map(lambda side: _stems(side, is_plant | is_other))
+    if len(before) == 0 or len(after) == 0:
+        return owner, np.zeros(0, dtype=np.int32)
+    found, back = nearest(after, before, _PLACE_M)[0], nearest(before, after, _PLACE_M)[0]
+    both = np.flatnonzero((found >= 0) & (back[found] == np.arange(len(before))))
+    place = (before[both] + after[found[both]]) / 2
+    host = np.rint(place[:, 2] / _LIFT_M).astype(np.int32)
+    away = np.linalg.norm(place[:, :2] - _crown_middles(surfaces, n)[host], axis=1)
+    order = np.lexsort((away, host))
     is_own = np.zeros(len(host), np.bool_)
-    middle = _crown_middles(surfaces, n)
-    away = np.nan_to_num(np.linalg.norm(place[:, :2] - middle[host], axis=1))
-    nearest_first = np.lexsort((away, host))
-    is_own[nearest_first] = np.diff(host[nearest_first], prepend=-1) != 0
+    is_own[order] = np.diff(host[order], prepend=-1) != 0
     is_pole = ~(is_own & is_plant[host])
     place, host = place[is_pole], host[is_pole]
-    if len(host) == 0:
-        return owner, host
 
     def with_poles(side: Surface) -> IntArray:
-        member = np.flatnonzero(np.append(np.isin(np.arange(n), host), False)[side.owner])
-        flat = np.column_stack([side.xyz[member, :2], side.owner[member] * _LIFT_M])
-        pole, _ = nearest(place, flat, _PLACE_M + _LINK_M / 4)
+        member = np.flatnonzero(np.isin(side.owner, host))
+        pole, _ = nearest(place, _flat(side, member), _REACH_M)
         mine = side.owner.copy()
         mine[member] = np.where(pole >= 0, n + pole, mine[member])
-        return mine.astype(np.int32)
+        return mine
 
-    return surfaces.map(with_poles), host
+    return (surfaces.map(with_poles) if len(host) else owner), host
 
 
 _LIFT_M = 100.0
@@ -95,7 +94,7 @@ def _stems(side: Surface, is_asked: BoolArray) -> FloatArray:
     low, high = _BREAST_M
     is_breast = np.append(is_asked, False)[side.owner] & (side.height > low) & (side.height < high)
     member = np.flatnonzero(is_breast)
-    flat = np.column_stack([side.xyz[member, :2], side.owner[member] * _LIFT_M])
+    flat = _flat(side, member)
     label, k = consecutive(linked(flat, _LINK_M))
     groups = Groups(label, k)
     lowest, highest = groups.extremes(side.height[member])
@@ -104,6 +103,11 @@ def _stems(side: Surface, is_asked: BoolArray) -> FloatArray:
         (groups.counts >= _LEAST_POINTS) & (highest - lowest >= _TALL_M) & (wide.max(axis=1, initial=0) <= _WIDE_M)
     )
     return np.asarray(groups.mean(flat)[is_stem])
+
+
+def _flat(side: Surface, member: Int64Array) -> FloatArray:
+    """Some points (k, 3) in plan, each object at a height of its own."""
+    return np.column_stack([side.xyz[member, :2], side.owner[member] * _LIFT_M])
 
 
 def _crown_middles(surfaces: Pair[Surface], n: int) -> FloatArray:
