@@ -123,7 +123,11 @@ class OutlierParams(StageParams):
     )
     keep_gap_m: float = param(0.6, "largest gap within such a cluster", unit="m", low=0.05, high=20, is_length=True)
     thin_gap_m: float = param(
-        1.2, "the same, where most of the cluster has nothing but outliers within it", unit="m", low=0.05, high=20
+        1.2,
+        "the same for what is no plane, a fifth of it apart from all else by as much; no more than keep_gap_m: never",
+        unit="m",
+        low=0.05,
+        high=20,
     )
 
 

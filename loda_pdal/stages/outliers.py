@@ -53,23 +53,35 @@ def find_outliers(xyz: FloatArray, params: OutlierParams) -> BoolArray:
         is_kept = _of_large_clusters(xyz[lonely], params.keep_gap_m, params.keep_voxels)
         if params.thin_gap_m > params.keep_gap_m:
             is_apart = nearest(xyz[dense], xyz[lonely], params.thin_gap_m)[0] < 0
-            is_kept |= _of_large_clusters(xyz[lonely], params.thin_gap_m, params.keep_voxels, is_apart)
+            is_kept |= _of_thin_things(xyz[lonely], is_apart, params)
         is_outlier[lonely[is_kept]] = False
     return is_outlier
 
 
-def _of_large_clusters(xyz: FloatArray, gap_m: float, least: int, is_apart: BoolArray | None = None) -> BoolArray:
-    """Which points (k, 3) hang together in clusters of at least so many; of these most must be apart, if that is
-    said."""
+def _of_large_clusters(xyz: FloatArray, gap_m: float, least: int) -> BoolArray:
+    """Which points (k, 3) hang together in clusters of at least so many."""
     cluster = Groups(linked(xyz, gap_m), len(xyz))
-    is_kept = cluster.counts >= least
-    if is_apart is not None:
-        is_kept &= cluster.share(is_apart) > _MOST_APART
-    return np.asarray(is_kept[cluster.labels])
+    return np.asarray((cluster.counts >= least)[cluster.labels])
 
 
-_MOST_APART = 0.2
+def _of_thin_things(xyz: FloatArray, is_apart: BoolArray, params: OutlierParams) -> BoolArray:
+    """Which points (k, 3) hang together over wider gaps, where some are apart from all that is sampled densely.
+
+    Only what is no plane: how much of a far wall or roof is seen depends on the way that was taken.
+    """
+    if len(xyz) == 0:
+        return np.zeros(0, np.bool_)
+    cluster = Groups(linked(xyz, params.thin_gap_m), len(xyz))
+    variance = np.linalg.eigvalsh(cluster.covariance(xyz))[:, 0]
+    is_kept = (cluster.counts >= params.keep_voxels) & (cluster.share(is_apart) > _SOME_APART)
+    return np.asarray((is_kept & (variance > _THICK_M**2))[cluster.labels])
+
+
+_SOME_APART = 0.2
 """Share of a thinly sampled thing that lies apart from all that is sampled densely."""
+
+_THICK_M = 0.3
+"""Standard deviation of a thing across the plane through it, from which on it is no wall."""
 
 
 def mean_neighbour_distance(xyz: FloatArray, k: int) -> FloatArray:
