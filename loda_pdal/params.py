@@ -122,13 +122,6 @@ class OutlierParams(StageParams):
         high=10000,
     )
     keep_gap_m: float = param(0.6, "largest gap within such a cluster", unit="m", low=0.05, high=20, is_length=True)
-    thin_gap_m: float = param(
-        1.2,
-        "the same for what is no plane, a fifth of it apart from all else by as much; no more than keep_gap_m: never",
-        unit="m",
-        low=0.05,
-        high=20,
-    )
 
 
 @dataclass(frozen=True)

@@ -73,15 +73,3 @@ def test_a_crown_over_dense_ground_is_no_noise_from_the_air() -> None:
     assert not is_outlier[: len(ground)].any()
     assert is_outlier[len(ground) : -3].sum() <= 5
     assert is_outlier[-3:].all()
-
-
-def test_a_crown_of_few_points_stays_where_all_is_thin_and_not_beside_what_is_dense() -> None:
-    ground = surface()[:-3]
-    crown = np.random.default_rng(5).uniform(-1.5, 1.5, (30, 3))
-    params = OutlierParams(k=8, std_multiplier=1.5)
-    far = crown + np.array([40.0, 0.0, 5.0])
-    beside = np.column_stack([crown[:, :2] * 2 + 3.0, np.abs(crown[:, 2]) / 2 + 0.4])
-    assert find_outliers(np.vstack([ground, far]), params)[len(ground) :].mean() < 0.2
-    assert find_outliers(np.vstack([ground, far]), replace(params, thin_gap_m=0.6))[len(ground) :].mean() > 0.8
-    wide, narrow = (find_outliers(np.vstack([ground, beside]), replace(params, thin_gap_m=gap)) for gap in (1.2, 0.6))
-    np.testing.assert_array_equal(wide, narrow)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from loda_pdal.kernels.clusters import linked
-from loda_pdal.kernels.neighbours import mean_distances, nearest
+from loda_pdal.kernels.neighbours import mean_distances
 from loda_pdal.model.cloud import BoolArray, FloatArray, VoxelCloud
-from loda_pdal.model.groups import Groups
 from loda_pdal.params import OutlierParams
 
 
@@ -30,8 +29,7 @@ def find_outliers(xyz: FloatArray, params: OutlierParams) -> BoolArray:
     """Points whose mean distance to their k nearest neighbours exceeds mean + multiplier * standard deviation.
 
     The neighbours of a thin pole lie along one line, and a wall far from the scanner is sampled thinly: with
-    ``keep_voxels``, what hangs together stays, over wider gaps where little but such points is near: crowns at the far
-    end of a street.
+    ``keep_voxels``, what hangs together stays.
 
     Parameters
     ----------
@@ -49,39 +47,10 @@ def find_outliers(xyz: FloatArray, params: OutlierParams) -> BoolArray:
     ascending = np.sort(distance)
     is_outlier = np.asarray(distance > ascending.mean() + params.std_multiplier * ascending.std(ddof=1))
     if params.keep_voxels > 0:
-        lonely, dense = np.flatnonzero(is_outlier), np.flatnonzero(~is_outlier)
-        is_kept = _of_large_clusters(xyz[lonely], params.keep_gap_m, params.keep_voxels)
-        if params.thin_gap_m > params.keep_gap_m:
-            is_apart = nearest(xyz[dense], xyz[lonely], params.thin_gap_m)[0] < 0
-            is_kept |= _of_thin_things(xyz[lonely], is_apart, params)
-        is_outlier[lonely[is_kept]] = False
+        lonely = np.flatnonzero(is_outlier)
+        cluster = linked(xyz[lonely], params.keep_gap_m)
+        is_outlier[lonely] = np.bincount(cluster, minlength=len(lonely))[cluster] < params.keep_voxels
     return is_outlier
-
-
-def _of_large_clusters(xyz: FloatArray, gap_m: float, least: int) -> BoolArray:
-    """Which points (k, 3) hang together in clusters of at least so many."""
-    cluster = Groups(linked(xyz, gap_m), len(xyz))
-    return np.asarray((cluster.counts >= least)[cluster.labels])
-
-
-def _of_thin_things(xyz: FloatArray, is_apart: BoolArray, params: OutlierParams) -> BoolArray:
-    """Which points (k, 3) hang together over wider gaps, where some are apart from all that is sampled densely.
-
-    Only what is no plane: how much of a far wall or roof is seen depends on the way that was taken.
-    """
-    if len(xyz) == 0:
-        return np.zeros(0, np.bool_)
-    cluster = Groups(linked(xyz, params.thin_gap_m), len(xyz))
-    variance = np.linalg.eigvalsh(cluster.covariance(xyz))[:, 0]
-    is_kept = (cluster.counts >= params.keep_voxels) & (cluster.share(is_apart) > _SOME_APART)
-    return np.asarray((is_kept & (variance > _THICK_M**2))[cluster.labels])
-
-
-_SOME_APART = 0.2
-"""Share of a thinly sampled thing that lies apart from all that is sampled densely."""
-
-_THICK_M = 0.3
-"""Standard deviation of a thing across the plane through it, from which on it is no wall."""
 
 
 def mean_neighbour_distance(xyz: FloatArray, k: int) -> FloatArray:
