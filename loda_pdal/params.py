@@ -406,6 +406,9 @@ class InstanceParams(StageParams):
     mobile_min_voxels: int = param(20, "fused points of the smallest mobile instance", low=1, high=10000)
     ground_erosion_m: float = param(0.15, "erosion of the ground mask", unit="m", low=0, high=5)
     other_min_voxels: int = param(5, "fused points of the smallest other object", low=1, high=10000)
+    other_min_points: int = param(
+        24, "raw points that make three fused points an other object as well; 0: never", low=0, high=10000
+    )
 
 
 @dataclass(frozen=True)
@@ -907,6 +910,7 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "mobile_min_points": 4,
             "mobile_min_voxels": 6,
             "other_min_voxels": 6,
+            "other_min_points": 0,
             "twig_voxels": 1000000,
         },
         "changes": {
@@ -958,7 +962,12 @@ _PRESET_VALUES: dict[str, dict[str, Any]] = {
             "points_near_ground_are_ground": False,
             "building_top_m": 0.0,
         },
-        "instances": {"join_by_footprint": False, "splits_crowns": False, "other_min_voxels": 12},
+        "instances": {
+            "join_by_footprint": False,
+            "splits_crowns": False,
+            "other_min_voxels": 12,
+            "other_min_points": 0,
+        },
         "observability": {"is_enabled": False},
         "ground_changes": {"min_area_m2": 25.0, "has_own_limit": False},
         "changes": {

@@ -221,3 +221,32 @@ def test_from_the_air_what_either_epoch_calls_a_vehicle_is_one(has_sides: bool, 
         has_sides=has_sides,
     )
     assert found.object_class.tolist() == [expected]
+
+
+@pytest.mark.parametrize(
+    ("kinds", "expected"),
+    [
+        ((ObjectClass.MOBILE, ObjectClass.BUILDING), ObjectClass.MOBILE),
+        ((ObjectClass.BUILDING, ObjectClass.MOBILE), ObjectClass.MOBILE),
+        ((ObjectClass.OTHER, ObjectClass.BUILDING), ObjectClass.BUILDING),
+    ],
+)
+def test_what_is_a_vehicle_in_one_epoch_and_a_building_in_the_other_is_a_vehicle(
+    kinds: tuple[ObjectClass, ObjectClass], expected: ObjectClass
+) -> None:
+    van = np.stack(np.meshgrid(np.arange(0, 5, 0.25), np.arange(0, 2, 0.25), [1.0]), axis=-1).reshape(-1, 3)
+    one = np.ones(len(van), np.int32)
+    instances = Pair(*kinds).map(
+        lambda kind: Instances(one, np.array([kind], np.uint8), np.full(len(van), kind, np.uint8))
+    )
+    found = match_instances(
+        Pair(van, van),
+        instances,
+        Pair((van, one), (van, one)),
+        Pair(*[describe(van, van[:, 2], one, 1, 10, 0.5, "upright")] * 2),
+        None,
+        0.6,
+        PARAMS,
+        has_sides=True,
+    )
+    assert found.object_class.tolist() == [expected]

@@ -15,6 +15,7 @@ from loda_pdal.params import ConfidenceParams, ObservabilityParams, Parameters
 from loda_pdal.stages.changes import Changes, decide_changes
 from loda_pdal.stages.cues import Surface
 from loda_pdal.stages.observability import Coverage, coverage
+from loda_pdal.stages.rules import Cue, verdict_of
 
 STREET = Parameters.preset("street")
 LOD_M = 0.05
@@ -686,3 +687,39 @@ def test_nothing_gives_nothing() -> None:
     for found in (decide(surface(), surface()), decide(nothing, nothing)):
         assert len(found) == 0
     assert found.reason == ()
+
+
+def plant(**figures: float) -> Cue:
+    """A plant that the before survey alone shows, as a whole."""
+    cue = Cue(**dict.fromkeys(Cue._fields, 0.0) | {"n_voxels": 100.0, "unshown": 50.0, "tall": 6.0} | figures)  # type: ignore[arg-type]
+    return cue._replace(object_class=ObjectClass.VEGETATION, is_before=True, is_after=False)
+
+
+@pytest.mark.parametrize(
+    ("support", "due", "seen", "expected"),
+    [
+        (0.28, 0.5, 0.3, ChangeLabel.UNCHANGED),  # as much of it as that sampling lets be expected
+        (0.28, 0.9, 0.3, ChangeLabel.UNDETERMINED),
+        (0.05, 0.08, 0.3, ChangeLabel.UNDETERMINED),  # five voxels tell nothing
+        (0.55, 1.0, 1.0, ChangeLabel.REMOVED),  # half of it lies within reach of its neighbours
+        (0.70, 1.0, 1.0, ChangeLabel.UNCHANGED),
+        (0.55, 0.9, 0.7, ChangeLabel.UNCHANGED),
+    ],
+)
+def test_a_plant_of_one_survey_is_judged_by_what_the_other_could_show_of_it(
+    support: float, due: float, seen: float, expected: ChangeLabel
+) -> None:
+    cue = plant(support_before=support, due_before=due, observability=seen)
+    assert verdict_of(cue, False, False, STREET.changes, STREET.observability).label == expected
+
+
+def test_a_wall_that_stands_aside_of_a_fence_is_another_thing_however_few_points_a_cell_holds() -> None:
+    fence, wall = block(0, 0, 8, 0.05, 1.25), block(0, 0.1, 8, 0.05, 1.25)
+    pair = Pair(surface((0, fence)), surface((0, wall)))
+    coarse = replace(lod_everywhere(pair), lod95=np.full(len(lod_everywhere(pair).cells), 0.5, np.float32))
+    codes, seen = np.array([ObjectClass.OTHER], np.uint8), Pair(everywhere(), everywhere())
+    found = decide_changes(pair, codes, seen, coarse, STREET.changes, STREET.observability, ConfidenceParams())
+    assert sorted(labels(found)) == [ChangeLabel.ADDED, ChangeLabel.REMOVED]
+    drifting = replace(coarse, drift=np.diag([0.0025, 0.0025, 0.0]))
+    found = decide_changes(pair, codes, seen, drifting, STREET.changes, STREET.observability, ConfidenceParams())
+    assert labels(found) == [ChangeLabel.UNCHANGED]

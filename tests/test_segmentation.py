@@ -20,6 +20,7 @@ from loda_pdal.stages.features import eigen_features
 from loda_pdal.stages.fuse import fuse_points
 from loda_pdal.stages.instances import (
     Instances,
+    _other,
     euclidean_clusters,
     form_instances,
     with_whole_bodies,
@@ -210,3 +211,13 @@ def test_a_body_of_which_a_building_holds_a_fifth_is_the_buildings() -> None:
     np.testing.assert_array_equal(found[20:], held[20:])  # a tenth, and nothing
     np.testing.assert_array_equal(with_whole_bodies(held, np.full(40, -1, np.int32)), held)
     assert len(with_whole_bodies(held[:0], body[:0])) == 0
+
+
+@pytest.mark.parametrize(("n_raw", "found"), [(9, True), (2, False)])
+def test_a_few_fused_points_with_many_raw_ones_are_a_thing(n_raw: int, found: bool) -> None:
+    xyz = np.column_stack([np.zeros((3, 2)), [0.2, 0.45, 0.7]])
+    nobody = np.zeros(3, np.bool_)
+    code = np.full(3, ObjectClass.OTHER, np.uint8)
+    label = _other(xyz, np.full(3, n_raw, np.int32), code, nobody, Parameters.preset("street").instances)
+    assert (label >= 0).tolist() == [found] * 3
+    assert (_other(xyz, np.full(3, n_raw, np.int32), code, nobody, Parameters.preset("aerial").instances) < 0).all()

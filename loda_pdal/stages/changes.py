@@ -41,8 +41,9 @@ from loda_pdal.stages.rules import (
     uncovered,
     verdict_of,
 )
+from loda_pdal.stages.stems import split_poles
 from loda_pdal.stages.things import carried_on, split_close_things, split_things
-from loda_pdal.stages.vehicles import ONE_VEHICLE_M, looks_like_vehicle, roughness, shape_change, tops_differ
+from loda_pdal.stages.vehicles import ONE_VEHICLE_M, Fit, looks_like_vehicle, roughness, shape_change, tops_differ
 
 
 @dataclass(frozen=True)
@@ -122,7 +123,7 @@ def decide_changes(
     """
     seen = coverage if observability.is_enabled or params.visible_only else None
     voxels = sample_voxels(surfaces, seen, lod, params)
-    cast, voxels = _divided(surfaces, object_class, voxels, params)
+    cast, voxels = _divided(surfaces, object_class, voxels, lod, params)
     cells = cast.cells(voxels, params)
     evidence = weigh(cells, cast.surfaces, len(cast), params)
     has_walls = not params.fills_buildings
@@ -189,7 +190,7 @@ def _without_uncovered(
 
 
 def _divided(
-    surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, params: ChangeParams
+    surfaces: Pair[Surface], object_class: ByteArray, voxels: Voxels, lod: LodGrid, params: ChangeParams
 ) -> tuple[Cast, Voxels]:
     """The objects as they are judged: pairs that are none undone, things and parts taken out (METHOD 2b); and the
     voxels, without the walls that only one survey could see."""
@@ -203,11 +204,15 @@ def _divided(
     is_inner = np.array([is_within(cue, params) for cue in cues], dtype=np.bool_)
     is_apart = np.array([is_no_pair(cue, params) for cue in cues], dtype=np.bool_) & ~is_inner
     is_open = voxels.at_points(cells.is_seen.swapped, cast.surfaces)
-    is_apart |= _is_replaced(cast, cues, voxels, is_open, params) & (share_beneath(cells, is_building) < _MOST_BENEATH)
+    is_another = _is_replaced(cast, cues, cells, is_open, lod, params)
+    is_apart |= is_another & (share_beneath(cells, is_building) < _MOST_BENEATH)
     if is_apart.any() or is_inner.any():
         cast = cast.without_pairs(is_apart)
         cast = cast.without_surroundings(is_inner, voxels.at_points(cells.is_near.swapped, cast.surfaces))
         cast = cast.settled(voxels)
+        cells = cast.cells(voxels, params)
+    if params.needs_sight:
+        cast = _with_poles(cast, cells, params).settled(voxels)
         cells = cast.cells(voxels, params)
     if params.thing_voxels > 0:
         is_vehicle = (cast.object_class == ObjectClass.MOBILE) & looks_like_vehicle(
@@ -238,6 +243,17 @@ def _divided(
     return cast, voxels
 
 
+def _with_poles(cast: Cast, cells: Cells, params: ChangeParams) -> Cast:
+    """The objects with poles taken out of the foliage on them, where some of that may have changed."""
+    n = len(cast)
+    new = np.concatenate([cells.owner.before[cells.is_lost], cells.owner.after[cells.is_gained]])
+    is_asked = cast.is_pair & (np.bincount(new, minlength=n) >= params.backing_voxels)
+    is_plant, is_other = (is_asked & (cast.object_class == c) for c in (ObjectClass.VEGETATION, ObjectClass.OTHER))
+    more = cast.with_more(*split_poles(cast.surfaces, is_plant, is_other))
+    is_pole = np.arange(len(more)) >= n
+    return replace(more, object_class=np.where(is_pole, ObjectClass.OTHER, more.object_class).astype(np.uint8))
+
+
 def _with_close_things(cast: Cast, voxels: Voxels, cells: Cells, params: ChangeParams) -> Cast:
     """The objects with small things taken out of them, and out of what only seems to be in the other survey too."""
     is_vehicle = (cast.object_class == ObjectClass.MOBILE) & looks_like_vehicle(cast.surfaces, len(cast))
@@ -250,23 +266,22 @@ def _with_close_things(cast: Cast, voxels: Voxels, cells: Cells, params: ChangeP
 
 
 def _is_replaced(
-    cast: Cast, cues: list[Cue], voxels: Voxels, is_open: Pair[BoolArray], params: ChangeParams
+    cast: Cast, cues: list[Cue], cells: Cells, is_open: Pair[BoolArray], lod: LodGrid, params: ChangeParams
 ) -> BoolArray:
     """Which vehicles, walls and fences stand where another one stood."""
     is_pair = np.array([cue.is_before and cue.is_after for cue in cues], dtype=np.bool_)
     is_loose = np.isin(cast.object_class, (ObjectClass.MOBILE, ObjectClass.OTHER)) & is_pair & (params.replaced_m > 0)
     is_vehicle = looks_like_vehicle(cast.surfaces, len(cast))
-    is_another = _stands_aside(cast, cues, is_loose & ~is_vehicle, params)
     is_large = np.array([cue.n_voxels >= _LEAST_VEHICLE for cue in cues], dtype=np.bool_)
-    is_asked = is_loose & is_vehicle & is_large
-    off = shape_change(cast.surfaces, is_open, is_asked)
-    rough = roughness(cast.surfaces, is_asked)
-    is_another |= (off > np.fmax(params.replaced_m, _ROUGH * rough)) & (rough < FOLIAGE_M)
+    aside = face_offset(cast.surfaces, is_loose)
+    fit = shape_change(cast.surfaces, is_open, is_loose & is_vehicle & is_large)
+    is_another = _stands_aside(cast, cells, aside, is_loose & ~is_vehicle, lod, params)
+    is_another |= _has_another_shape(cast, cells, aside, fit, lod, params)
     if params.replaced_top_m > 0:
         rise = np.minimum(
-            [abs(cue.dh) for cue in cues], np.abs(median_rise(voxels, cast.surfaces, len(cast), _LEAST_TOPS))
+            [abs(cue.dh) for cue in cues], np.abs(median_rise(cells.voxels, cast.surfaces, len(cast), _LEAST_TOPS))
         )
-        is_few = is_pair & (cast.object_class == ObjectClass.MOBILE) & np.isnan(off)
+        is_few = is_pair & (cast.object_class == ObjectClass.MOBILE) & np.isnan(fit.off)
         is_another |= is_few & ((rise > params.replaced_top_m) | (tops_differ(cast.surfaces, is_few) > _SURE))
     return np.asarray(is_another)
 
@@ -278,14 +293,53 @@ def _is_line(cast: Cast) -> BoolArray:
     return np.asarray(size.min(axis=1) < _LINE_M)
 
 
-def _stands_aside(cast: Cast, cues: list[Cue], is_asked: BoolArray, params: ChangeParams) -> BoolArray:
-    """Which of the solid things asked for have their faces elsewhere than before."""
-    aside = face_offset(cast.surfaces, is_asked)
-    lod95 = np.array([cue.lod95 for cue in cues], dtype=np.float64)
-    limit = np.fmax(params.replaced_m, params.lod_factor * lod95 if params.use_lod else 0.0)
-    is_off = aside > limit
+def _stands_aside(
+    cast: Cast, cells: Cells, aside: FloatArray, is_asked: BoolArray, lod: LodGrid, params: ChangeParams
+) -> BoolArray:
+    """Which of the solid things asked for have their faces ``aside`` (n,) m of where they were."""
+    limit = _shared_limit(cells, is_asked, cells.voxels.normal, lod, params)
+    is_off = is_asked & (aside > np.fmax(params.replaced_m, limit))
     return is_off & (roughness(cast.surfaces, is_off) < FOLIAGE_M)
 
+
+def _has_another_shape(
+    cast: Cast, cells: Cells, aside: FloatArray, fit: Fit, lod: LodGrid, params: ChangeParams
+) -> BoolArray:
+    """Which of the vehicles that were compared have another shape, or stand higher or lower and not where they stood.
+
+    What is no vehicle stays where it is: its faces lie ``aside`` (n,) m if it is another one.
+    """
+    is_asked = np.isfinite(fit.off)
+    rough = roughness(cast.surfaces, is_asked)
+    is_fixed = (cast.object_class == ObjectClass.OTHER) & (aside < params.replaced_m / 2)
+    is_off = (fit.off > np.fmax(params.replaced_m, _ROUGH * rough)) & ~is_fixed
+    limit = _shared_limit(cells, is_asked, np.array([0.0, 0.0, 1.0]), lod, params)
+    is_lifted = np.abs(fit.move[:, 2]) > np.fmax(_SPRINGS_M, limit)
+    is_elsewhere = np.hypot(fit.move[:, 0], fit.move[:, 1]) > _PARKED_M
+    return np.asarray((is_off | (is_lifted & is_elsewhere)) & (rough < FOLIAGE_M))
+
+
+def _shared_limit(
+    cells: Cells, is_asked: BoolArray, normal: FloatArray, lod: LodGrid, params: ChangeParams
+) -> FloatArray:
+    """What objects (n,) must move, m, along the normals (c, 3) of their voxels, or one for all; NaN if not asked for.
+
+    The noise of their points averages out of a median over all of them; pose and drift, which they share, do not.
+    """
+    before, after = cells.owner
+    voxels = cells.voxels
+    is_face = (before == after) & np.append(is_asked, False)[before] & np.isfinite(voxels.displacement)
+    found = np.flatnonzero(is_face & params.use_lod)
+    along = np.broadcast_to(normal, voxels.centre.shape)[found]
+    limit = lod.limit_of(np.zeros(len(found)), voxels.centre[found], along)
+    return params.lod_factor * Groups(before[found], len(is_asked)).median(limit)
+
+
+_SPRINGS_M = 0.04
+"""A vehicle that is loaded or cold stands no more than this lower or higher than it did."""
+
+_PARKED_M = 0.05
+"""Nobody parks another vehicle this exactly where one stood."""
 
 _FALLS = 0.1
 """Slope of a roof, m per m, that is meant: what is level as built is measured within less."""

@@ -250,17 +250,31 @@ def _numbered(
     n = max((int(side.max()) + 1 for side in of_instance if len(side)), default=0)
     rank = rank_by_place(xyz, owner, n)
     of_instance = of_instance.map(lambda side: rank[side])
-    votes_per_class = np.zeros((n, 256), dtype=np.int64)
-    for side, own in zip(of_instance, instances, strict=True):
-        voxels = np.bincount(own.instance, minlength=len(own) + 1)[1:]
-        np.add.at(votes_per_class, (side, own.object_class), voxels)
+    voxels = of_instance.join(instances, lambda side, own: _voxels_per_class(side, own, n))
+    both = voxels.before + voxels.after
     if not has_sides:  # of a van from above one survey met the bonnet, and to the other it is what is left
-        is_vehicle = votes_per_class[:, ObjectClass.MOBILE] > 0
-        votes_per_class[is_vehicle, ObjectClass.MOBILE] += votes_per_class[is_vehicle, ObjectClass.OTHER]
-    priority = np.array(OBJECT_CLASSES, dtype=np.uint8)
-    object_class = priority[np.argmax(votes_per_class[:, priority], axis=1)] if n else np.zeros(0, np.uint8)
+        mobile, other = (OBJECT_CLASSES.index(kind) for kind in (ObjectClass.MOBILE, ObjectClass.OTHER))
+        both[:, mobile] += np.where(both[:, mobile] > 0, both[:, other], 0.0)
+    object_class = _most_common_class(both)
+    if has_sides:  # a lorry in the slot of a van is as large as a building, but no van grew into one
+        before, after = voxels.map(_most_common_class)
+        is_vehicle = (before == ObjectClass.MOBILE) & (after == ObjectClass.BUILDING)
+        is_vehicle |= (before == ObjectClass.BUILDING) & (after == ObjectClass.MOBILE)
+        object_class = np.where(is_vehicle, np.uint8(ObjectClass.MOBILE), object_class)
     owner = owner.map(lambda side: np.append(rank, np.int32(-1))[side])
     return Objects(of_instance, object_class, pairs, votes.map(lambda side: side.support), owner)
+
+
+def _voxels_per_class(of_instance: IntArray, instances: Instances, n: int) -> FloatArray:
+    """Fused points (n, classes) of each object in one epoch, by the class of their instances."""
+    voxels = np.bincount(instances.instance, minlength=len(instances) + 1)[1:]
+    is_of_class = instances.object_class[:, None] == np.array(OBJECT_CLASSES)
+    return Groups(of_instance, n).sum(voxels[:, None] * is_of_class)
+
+
+def _most_common_class(voxels: FloatArray) -> ByteArray:
+    """The class (n,) of most of each object's fused points (n, classes), the first of `OBJECT_CLASSES` at a tie."""
+    return np.asarray(np.array(OBJECT_CLASSES, dtype=np.uint8)[np.argmax(voxels, axis=1)])
 
 
 def rank_by_place(xyz: Pair[FloatArray], owner: Pair[IntArray], n: int) -> IntArray:

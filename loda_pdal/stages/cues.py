@@ -189,6 +189,8 @@ class Cells:
         Raw points of that epoch's owner there; none in what was filled in beneath a roof.
     odds : Pair of (c,) float64
         How likely that epoch's sampling was to meet what the other epoch shows there; 1 where that is not weighed.
+    due : Pair of (c,) float64
+        How likely it was to meet any of it within reach; 1 where no rule asks.
     """
 
     voxels: Voxels
@@ -196,6 +198,7 @@ class Cells:
     is_seen: Pair[BoolArray]
     n_raw: Pair[FloatArray]
     odds: Pair[FloatArray]
+    due: Pair[FloatArray]
 
     @property
     def is_measured(self) -> Pair[BoolArray]:
@@ -260,6 +263,8 @@ class Evidence:
         95th percentile of height above the ground of each epoch.
     support : Pair
         Share of an epoch's voxels with raw points that the other epoch shows too.
+    due : Pair
+        What that share would be, were the object unchanged, by the sampling of the other epoch.
     gained, lost
         Voxels that only the after, or only the before epoch has, where the other could have seen them;
         ``gained_above`` and ``lost_above`` are those beyond the other epoch's top, ``gained_clear`` and ``lost_clear``
@@ -289,6 +294,7 @@ class Evidence:
     volume: Pair[FloatArray]
     height: Pair[FloatArray]
     support: Pair[FloatArray]
+    due: Pair[FloatArray]
     gained: FloatArray
     lost: FloatArray
     iou: FloatArray
@@ -398,14 +404,15 @@ def cells_with_owners(
     holder, points = voxels.holders(surfaces, n)
     owner, n_raw = (Pair(*np.ascontiguousarray(values.T)) for values in (holder, points))
     is_seen = voxels.is_covered
-    odds = n_raw.map(np.ones_like)
+    odds = due = n_raw.map(np.ones_like)
     is_porous = np.ones(n, np.bool_) if is_solid is None else ~is_solid
     if params.min_expected_points > 0:
         within = owner.join(n_raw, lambda side, points: _with_beside(voxels.beside, side, points))
         expected = _expected_points(voxels, owner, n_raw, within, is_porous)
         is_seen = is_seen.join(expected, lambda seen, points: seen & (points >= params.min_expected_points))
+        due = expected.map(_odds_of)
     if params.weighs_sampling:
-        odds = _expected_points(voxels, owner, n_raw, n_raw, is_porous).map(lambda points: 1.0 - np.exp(-points))
+        odds = _expected_points(voxels, owner, n_raw, n_raw, is_porous).map(_odds_of)
     if is_solid is not None and is_solid.any():
         own = owner.swapped  # what each epoch should have seen is the other's
         is_hidden = Pair(
@@ -414,7 +421,12 @@ def cells_with_owners(
         )
         solid = own.map(lambda side: np.append(is_solid, False)[side])
         is_seen = is_seen.join(solid.join(is_hidden, np.logical_and), lambda seen, hidden: seen & ~hidden)
-    return Cells(voxels, owner, is_seen, n_raw, odds)
+    return Cells(voxels, owner, is_seen, n_raw, odds, due)
+
+
+def _odds_of(points: FloatArray) -> FloatArray:
+    """How likely (c,) a point is, where so many are expected."""
+    return 1.0 - np.exp(-points)
 
 
 def _ends_of_columns(
@@ -610,6 +622,10 @@ def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -
         _count(own.before, cells.is_measured.before & cells.is_near.after, n),
         _count(own.after, cells.is_measured.after & cells.is_near.before, n),
     )
+    n_due = Pair(
+        _count(own.before, cells.is_measured.before, n, cells.due.after),
+        _count(own.after, cells.is_measured.after, n, cells.due.before),
+    )
     gained = _count(own.after, cells.is_gained, n, cells.odds.before)
     lost = _count(own.before, cells.is_lost, n, cells.odds.after)
     voxel, owner = _either(cells)
@@ -645,6 +661,7 @@ def weigh(cells: Cells, surfaces: Pair[Surface], n: int, params: ChangeParams) -
         volume=volume,
         height=height,
         support=n_shared.join(n_measured, lambda shared, count: shared / np.maximum(count, 1)),
+        due=n_due.join(n_measured, lambda expected, count: expected / np.maximum(count, 1)),
         gained=gained,
         lost=lost,
         iou=iou,

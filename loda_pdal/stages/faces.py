@@ -24,7 +24,7 @@ _UPRIGHT = 0.5
 _ALIGNED = 0.8
 """Half the length of the sum of two normals of faces that are compared."""
 
-_MIN_FACES = 50
+_MIN_FACES = 100
 
 
 def face_offset(surfaces: Pair[Surface], is_asked: BoolArray) -> FloatArray:

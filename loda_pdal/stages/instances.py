@@ -91,7 +91,7 @@ def form_instances(
         is_mobile = classification == ObjectClass.MOBILE
         is_mobile &= ~_near_ground_edge(xyz, height, classification, params)
         mobile = _mobile(xyz, n_raw, is_mobile, params)
-    other = _other(xyz, classification, (vegetation >= 0) | (mobile >= 0), params)
+    other = _other(xyz, n_raw, classification, (vegetation >= 0) | (mobile >= 0), params)
 
     classes: list[ByteArray] = []
     n_so_far = 0
@@ -459,14 +459,27 @@ def _mobile(xyz: FloatArray, n_raw: IntArray, is_mobile: BoolArray, params: Inst
     return _without_small(label, params.mobile_min_voxels)
 
 
-def _other(xyz: FloatArray, classification: ByteArray, is_taken: BoolArray, params: InstanceParams) -> IntArray:
-    """Instance of what has no other class (poles, walls, fences), -1 none: connected points."""
+def _other(
+    xyz: FloatArray, n_raw: IntArray, classification: ByteArray, is_taken: BoolArray, params: InstanceParams
+) -> IntArray:
+    """Instance of what has no other class (poles, walls, fences), -1 none: connected points.
+
+    A bollard beside the way is hit often, and yet not large: a few fused points with many raw ones are a thing too.
+    """
     label = np.full(len(xyz), -1, dtype=np.int32)
     leftover = np.isin(classification, (ObjectClass.OTHER, ObjectClass.MOBILE, ObjectClass.VEGETATION)) & ~is_taken
     members = np.flatnonzero(leftover)
     if len(members):
         label[members] = euclidean_clusters(xyz[members], params.building_gap_m)
-    return _without_small(label, params.other_min_voxels)
+    large = _without_small(label, params.other_min_voxels)
+    if params.other_min_points == 0:
+        return large
+    dense = _without_small(_without_small(label, _LEAST_DENSE), params.other_min_points, n_raw)
+    return np.fmax(large, dense)
+
+
+_LEAST_DENSE = 3
+"""Fused points, one above the other, of a thing that many raw points show."""
 
 
 def _without_small(label: IntArray, least: int, weight: IntArray | None = None) -> IntArray:

@@ -23,6 +23,8 @@ class Cue(NamedTuple):
     is_after: bool
     support_before: float
     support_after: float
+    due_before: float
+    due_after: float
     gained: float
     lost: float
     iou: float
@@ -66,7 +68,9 @@ def cues_of(evidence: Evidence, object_class: ByteArray, regions: Pair[FloatArra
         evidence.n_voxels.after > 0,
         evidence.support.before,
         evidence.support.after,
-        *(getattr(evidence, name) for name in Cue._fields[5:-6]),
+        evidence.due.before,
+        evidence.due.after,
+        *(getattr(evidence, name) for name in Cue._fields[7:-6]),
         np.fmax(evidence.n_voxels.before, evidence.n_voxels.after),
         *evidence.volume,
         *regions,
@@ -192,8 +196,14 @@ _WITHIN_REACH = 0.4
 def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: ObservabilityParams) -> Verdict:
     """Objects of one epoch only: not seen, seen under another name, or really Added or Removed."""
     label, other = (ChangeLabel.ADDED, "before") if cue.is_after else (ChangeLabel.REMOVED, "after")
-    support = cue.support_after if cue.is_after else cue.support_before
+    support, due = (cue.support_after, cue.due_after) if cue.is_after else (cue.support_before, cue.due_before)
+    is_plant = cue.object_class == ObjectClass.VEGETATION
     if observability.is_enabled and cue.observability < observability.min_observability:
+        if is_plant and support * cue.n_voxels >= params.backing_voxels and support >= params.min_support * due:
+            return Verdict(
+                ChangeLabel.UNCHANGED,
+                f"{support:.0%} of it is in the {other} survey too, whose sampling lets {due:.0%} be expected",
+            )
         return Verdict(
             ChangeLabel.UNDETERMINED,
             f"the {other} survey could have seen only {cue.observability:.0%} of it "
@@ -205,7 +215,10 @@ def _unmatched(cue: Cue, is_apart: bool, params: ChangeParams, observability: Ob
             label, f"what the {other} survey shows there is another object; it shares {support:.0%} of the surface"
         )
     is_hidden = params.needs_sight and cue.observability - support < _LEAST_EMPTY
-    if support >= params.min_support * (cue.observability if is_hidden else 1.0):
+    least = params.min_support * (cue.observability if is_hidden else 1.0)
+    if params.needs_sight and is_plant and not is_hidden:
+        least = max(least, _BESIDE_OTHERS * cue.observability)
+    if support >= least:
         return Verdict(
             ChangeLabel.UNCHANGED,
             f"{support:.0%} of its surface is in the {other} survey too, as part of other objects",
@@ -232,6 +245,10 @@ def _hidden(cue: Cue) -> str:
 
 _LEAST_EMPTY = 0.2
 """Share of an object that the other survey must have seen empty, where it shows half of what it could see of it."""
+
+
+_BESIDE_OTHERS = 2 / 3
+"""Share of what the other survey could see of a plant that it must show: half may be within reach of its neighbours."""
 
 
 def _mobile(cue: Cue, params: ChangeParams) -> Verdict:

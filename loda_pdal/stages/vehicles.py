@@ -50,11 +50,27 @@ _APART_M = 100.0
 """Vehicles are lifted so far from each other that none sees another: one search serves them all."""
 
 
-def shape_change(surfaces: Pair[Surface], is_open: Pair[BoolArray], is_asked: BoolArray) -> FloatArray:
-    """How far the shapes of objects differ between the epochs, (n,) m; NaN where not asked for or too few points.
+class Fit(NamedTuple):
+    """How well objects fit themselves in the other epoch; NaN where not asked for or too few points.
+
+    Attributes
+    ----------
+    off : (n,) float64, m
+        How far their shapes differ after the best move.
+    move : (n, 3) float64, m
+        That move along x, y and z, from before to after.
+    """
+
+    off: FloatArray
+    move: FloatArray
+
+
+def shape_change(surfaces: Pair[Surface], is_open: Pair[BoolArray], is_asked: BoolArray) -> Fit:
+    """How far the shapes of objects differ between the epochs, and how far they were moved to fit.
 
     The upper quartile of the point-to-plane residuals of one epoch's points on the other's surface after the best move,
-    from the epoch that fits better: what only one epoch shows of a vehicle does not count against it.
+    from the epoch that fits better: what only one epoch shows of a vehicle does not count against it. The move is the
+    mean of that of one epoch onto the other, and of the other one back.
 
     Parameters
     ----------
@@ -65,11 +81,12 @@ def shape_change(surfaces: Pair[Surface], is_open: Pair[BoolArray], is_asked: Bo
     is_asked : (n,) bool
         Objects that are compared, present in both epochs.
     """
-    if not is_asked.any():
-        return np.full(len(is_asked), np.nan)
-    sides = lifted(surfaces, is_asked, is_open)
     n = len(is_asked)
-    return np.fmin(_residual(sides.before, sides.after, n), _residual(sides.after, sides.before, n))
+    if not is_asked.any():
+        return Fit(np.full(n, np.nan), np.full((n, 3), np.nan))
+    sides = lifted(surfaces, is_asked, is_open)
+    forth, back = _fit(sides.before, sides.after, n), _fit(sides.after, sides.before, n)
+    return Fit(np.fmin(forth.off, back.off), (forth.move - back.move) / 2)
 
 
 def roughness(surfaces: Pair[Surface], is_asked: BoolArray) -> FloatArray:
@@ -246,8 +263,8 @@ def lifted(surfaces: Pair[Surface], is_asked: BoolArray, is_open: Pair[BoolArray
     return surfaces.join(is_open or surfaces.map(lambda side: np.ones(len(side.owner), np.bool_)), of_epoch)
 
 
-def _residual(side: Aloft, other: Aloft, n: int) -> FloatArray:
-    """Upper quartile (n,) m of the residuals of one epoch's points on the other's."""
+def _fit(side: Aloft, other: Aloft, n: int) -> Fit:
+    """Upper quartile of the residuals of one epoch's points on the other's, and the move of ``side``."""
     owner, xyz = side.owner, side.xyz
     groups = Groups(owner, n)
     arm = xyz[:, :2] - groups.mean(xyz[:, :2])[owner]
@@ -263,7 +280,9 @@ def _residual(side: Aloft, other: Aloft, n: int) -> FloatArray:
     residual = np.where(found >= 0, residual, _FAR_M)
     residual[~(side.is_open | (distance <= _NEAR_M))] = np.nan
     counted = Groups(np.where(np.isfinite(residual), owner, -1), n)
-    return np.where(counted.counts >= _MIN_POINTS, groups.quantile(residual, 0.75), np.nan)
+    is_told = counted.counts >= _MIN_POINTS
+    off = np.where(is_told, groups.quantile(residual, 0.75), np.nan)
+    return Fit(off, np.where(is_told[:, None], move[:, :3], np.nan))
 
 
 def _at(xyz: FloatArray, arm: FloatArray, move: FloatArray) -> FloatArray:
