@@ -351,9 +351,11 @@ def sample_voxels(
     covered, hidden = Pair(always, always), Pair(never, never)
     is_open = xyz.map(lambda points: np.ones(len(points), np.bool_))
     over, clear = Pair(always, always), Pair(never, never)
-    if params.fills_buildings:
-        clear = surfaces.map(lambda surface: _is_clear(cell, columns, surface, params.voxel_m))
     z = centre[:, 2]
+    if params.fills_buildings:
+        heights = surfaces.map(lambda side: np.column_stack([side.xyz[:, :2], side.height])[side.n_raw > 0])
+        top = heights.map(lambda points: _ends_of_columns(cell, columns, points, params.voxel_m)[1])
+        clear = top.map(lambda high: (high > -np.inf) & (high < _ON_GROUND_M))
     if params.needs_sight or params.thing_voxels > 0:
         over = surfaces.map(lambda side: _ends_of_columns(cell, columns, side.xyz, params.voxel_m)[0] < z)
     measured = surfaces.map(lambda surface: surface.xyz[surface.n_raw > 0])
@@ -366,11 +368,8 @@ def sample_voxels(
         if params.needs_returns:
             covered = covered.join(over, np.logical_and)
         if params.looks_down:
-            top = z + params.voxel_m / 2
-            below = measured.map(lambda points: _ends_of_columns(cell, columns, points, params.voxel_m)[0] < top)
-            bodies = surfaces.map(lambda surface: surface.xyz[surface.n_raw == 0])
-            under = bodies.map(lambda points: _ends_of_columns(cell, columns, points, params.voxel_m, reach=1)[1] > top)
-            covered = Pair(*(c & b & ~u for c, b, u in zip(covered, below, under, strict=True)))
+            from_above = surfaces.map(lambda side: _from_above(side, cell, columns, params.voxel_m))
+            covered = covered.join(from_above, np.logical_and)
         is_open = coverage.swapped.join(xyz, lambda other, points: other.at(points))
         if params.needs_sight:
             shaded = _in_shadow(cell, columns, surfaces, params.voxel_m)
@@ -443,9 +442,22 @@ def _ends_of_columns(
         place = cells_of(xyz[:, :2], voxel_m)
         for step in np.ndindex(2 * reach + 1, 2 * reach + 1):
             inside = Groups(lattice.find(keys, place + (np.array(step) - reach)), len(first))
-            low, high = np.fmin(low, inside.minimum(xyz[:, 2])), np.fmax(high, inside.maximum(xyz[:, 2]))
+            lowest, highest = inside.extremes(xyz[:, 2])
+            low, high = np.fmin(low, lowest), np.fmax(high, highest)
     size = np.diff(columns)
     return np.repeat(low, size), np.repeat(high, size)
+
+
+def _from_above(surface: Surface, cell: Int64Array, columns: Int64Array, voxel_m: float) -> BoolArray:
+    """Whether an epoch measured something in or beneath each voxel (c,), and shows no roof above it or beside that.
+
+    What was filled in beneath roofs has no raw points.
+    """
+    top = (cell[:, 2] + 1) * voxel_m
+    is_measured = surface.n_raw > 0
+    low, _ = _ends_of_columns(cell, columns, surface.xyz[is_measured], voxel_m)
+    _, roof = _ends_of_columns(cell, columns, surface.xyz[~is_measured], voxel_m, reach=1)
+    return np.asarray((low < top) & (roof <= top))
 
 
 def _in_shadow(cell: Int64Array, columns: Int64Array, surfaces: Pair[Surface], voxel_m: float) -> Pair[BoolArray]:
@@ -481,19 +493,6 @@ _LEAST_GROUND = 12
 
 _HARDLY_ANY = 0.1
 """Share of the other epoch's ground: shadows are dark."""
-
-
-def _is_clear(cell: Int64Array, columns: Int64Array, surface: Surface, voxel_m: float) -> BoolArray:
-    """Whether the surface's returns in the column of each voxel (c,) all lie on the ground; False where it has none."""
-    first = columns[:-1]
-    if len(first) == 0:
-        return np.zeros(len(cell), np.bool_)
-    plan = cell[first, :2]
-    lattice = Lattice.around(plan)
-    measured = surface.n_raw > 0
-    column = lattice.find(lattice.keys(plan), cells_of(surface.xyz[measured, :2], voxel_m))
-    highest = Groups(column, len(first)).maximum(surface.height[measured])
-    return np.repeat(highest < _ON_GROUND_M, np.diff(columns))
 
 
 _ON_GROUND_M = 0.5
